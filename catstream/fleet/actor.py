@@ -8,6 +8,7 @@ the tracks.
 from __future__ import annotations
 
 import logging
+import math
 import shutil
 import threading
 import time
@@ -33,6 +34,7 @@ from catstream.jobs.state import files, restore
 from catstream.messages.kinds import StreamState, StreamStatus, Track
 from catstream.messages.storage import Metadata
 from catstream.pipeline import Pipeline
+from catstream.processes.decisions import DESIRED
 from catstream.sinks.destinations import Origin, TrackedFrame
 from catstream.sinks.events import check_zones
 from catstream.sinks.track_log import OpenFiles, RunFiles, is_log
@@ -43,6 +45,8 @@ FIRST_PAUSE_SECONDS = 1.0  # before a stream that failed starts again; doubled e
 LONGEST_PAUSE_SECONDS = 60.0  # the most of these
 _FORGOTTEN_SECONDS = 60.0  # of running, after which earlier failures do not count
 _TRACKS_SECONDS = 0.1  # longest wait for a frame
+_CHECK_SECONDS = 5.0  # between two checks of the claim if `every` is 0
+_STORE_RATE = 0.1e6  # bytes per second that are stored then: 9 GB a day
 
 _log = logging.getLogger(__name__)
 
@@ -53,22 +57,24 @@ class Stream:
     node     id of its node
     address  IP address at which other machines reach its sockets; empty if all clients are on this machine
     clients  the clients that may connect, by name, if there is an address
-    every    seconds between two states in the store
+    every    seconds between two states in the store; 0 for an interval that grows with their size
     """
 
     def __init__(
         self, spec: StreamSpec, node: str, address: str, clients: dict[str, Client], store: str, every: float
     ) -> None:
         self._spec, self._address, self._clients = spec, address, clients
-        self._url, self._every = store, every
+        self._url, self._every, self._rate = store, every or _CHECK_SECONDS, math.inf if every else _STORE_RATE
         self._store: Store
+        self._claim: Claim
         source = without_password(spec.source)
         self._status = StreamStatus(spec.name, "starting", node, source, live=is_live(spec.source))
         self._stop, self._lock = threading.Event(), threading.Lock()
         self._stored_at = 0.0  # seconds since 1970 at which the state was that in the store
         self._failure = self._store_trouble = self._pipeline_trouble = ""
         self._superseded = self._has_tracked = False
-        self._files: set[tuple[str, int]] = set()  # of the state that was stored last, with their times
+        self._files: set[tuple[Path, int]] = set()  # of the state that was stored last, with their times
+        self._due = 0.0  # time at which the next state is stored
         self._stack = ExitStack()
         self._folder = self._stack.enter_context(private_folder())
         self._keys = self._folder / "keys"
@@ -113,6 +119,9 @@ class Stream:
                     self._failure = str(error) if is_known else f"{type(error).__name__}: {error}"
                     self._pipeline_trouble = ""
                     self._status = replace(self._status, state="failed", endpoint="", present={})
+                if self._has_tracked:  # what it has learned since the last state
+                    self._due = 0.0
+                    self._write()
             pause = FIRST_PAUSE_SECONDS if time.monotonic() - began > _FORGOTTEN_SECONDS else pause
             self._stop.wait(pause)
             pause = min(2 * pause, LONGEST_PAUSE_SECONDS)
@@ -120,7 +129,7 @@ class Stream:
     def _run_once(self) -> None:
         """Claim the stream, and run the pipeline from the state in the store, or from the start."""
         self._store = Store(self._url)
-        claim = self._store.stream(self._spec.name).claim()
+        claim = self._claim = self._store.stream(self._spec.name).claim()
         self._store_trouble = ""
         shutil.rmtree(self._folder / "state", ignore_errors=True)  # of the run before a failure
         self._has_tracked, self._files, ended = False, set(), False
@@ -153,7 +162,7 @@ class Stream:
                 )
             self._change_objects(pipeline, facts)
             over = threading.Event()
-            storing = threading.Thread(target=self._keep_storing, args=(claim, over), name="store")
+            storing = threading.Thread(target=self._keep_storing, args=(over,), name="store")
             storing.daemon = True  # a store that hangs must not keep the process
             storing.start()
             stack.callback(storing.join)
@@ -172,12 +181,12 @@ class Stream:
                     break
             else:
                 ended = True
-        self._write_last(claim, ended=ended)
+        self._write_last(ended=ended)
 
-    def _write_last(self, claim: Claim, *, ended: bool) -> None:
+    def _write_last(self, *, ended: bool) -> None:
         """Store the last state. A stream has ended once that is done, so it is tried again until it is."""
         while not self._superseded:
-            self._write(claim, is_last=True, ended=ended)
+            self._write(is_last=True, ended=ended)
             if not self._store_trouble:
                 with self._lock:
                     self._status = replace(self._status, state="ended" if ended else self._status.state, present={})
@@ -247,13 +256,16 @@ class Stream:
             self._status = replace(status, state=state, skipped=skipped, missed=missed, present=present)
             self._pipeline_trouble = "; ".join(troubles)
 
-    def _keep_storing(self, claim: Claim, over: threading.Event) -> None:
-        """Store the state every few seconds until the pipeline is over, or another process has claimed the stream."""
+    def _keep_storing(self, over: threading.Event) -> None:
+        """Store the state again and again until the pipeline is over, or another process has claimed the stream."""
         while not over.wait(self._every) and not self._superseded:
-            self._write(claim)
+            self._write()
 
-    def _write(self, claim: Claim, *, is_last: bool = False, ended: bool = False) -> None:
-        """Store the newest checkpoint, if it has changed. A failure is a trouble; a newer claim ends the stream."""
+    def _write(self, *, is_last: bool = False, ended: bool = False) -> None:
+        """Store the newest checkpoint if it is due, and what was commanded at once; check the claim in any case.
+
+        A failure is a trouble; a newer claim ends the stream.
+        """
         state, trouble, now = self._folder / "state", "", time.time()
         facts: Metadata = {
             "time": now,
@@ -263,15 +275,18 @@ class Stream:
             "ended": ended,
         }
         try:
-            versions = {(str(path), path.stat().st_mtime_ns) for path in state.rglob("*.*") if path.is_file()}
+            versions = {(path, path.stat().st_mtime_ns) for path in state.rglob("*.*") if path.is_file()}
+            was_commanded = any(path.name == DESIRED for path, _ in versions - self._files)
+            is_due = is_last or was_commanded or time.monotonic() >= self._due
             if versions == self._files and not is_last:
-                claim.check()
+                self._claim.check()
                 self._stored_at = now
-            elif content := files(state):
-                claim.write(content, facts)
+            elif is_due and (content := files(state)):
+                self._claim.write(content, facts)
                 self._files, self._stored_at = versions, now
-            else:  # no checkpoint yet
-                claim.check()
+                self._due = time.monotonic() + sum(map(len, content.values())) / self._rate
+            else:  # not due, or no checkpoint yet
+                self._claim.check()
         except FencedError as error:
             _log.warning("%s: %s", self._spec.name, error)
             self._superseded = True

@@ -38,7 +38,7 @@ _HOST_AND_PORT = Annotated[str, Meta(pattern=r"^([A-Za-z0-9_.-]+:[0-9]{1,5})?$")
 _FLEET: dict[str, tuple[Any, str]] = {
     "name": (str, "a text"),
     "store": (str, "a text"),
-    "every": (Annotated[float, Meta(gt=0, le=3600)], "a number of seconds above 0 and at most 3600"),
+    "every": (Annotated[float, Meta(ge=0, le=3600)], "a number of seconds from 0 to 3600"),
     "registry": (_HOST_AND_PORT, "HOST:PORT of a node, as in 10.0.0.1:5690"),
     "defaults": (dict[str, Any], "a table [defaults]"),
     "streams": (dict[str, Any], "tables [streams.NAME]"),
@@ -151,14 +151,14 @@ class FleetSpec:
 
     name     name of the fleet, with the rules of a stream's name
     store    folder or URL of the states; "" for a folder that belongs to the fleet
-    every    seconds between two states of a stream in the store
+    every    seconds between two states of a stream in the store; 0: as often as 9 GB a day allow
     registry HOST:PORT where clients ask for the streams; "" for the head of the cluster, and the default port
     streams  the streams by name
     """
 
     name: str
     store: str = ""
-    every: float = 5.0
+    every: float = 0.0
     registry: str = ""
     streams: dict[str, StreamSpec] = field(default_factory=dict)
 

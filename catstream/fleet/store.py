@@ -7,7 +7,7 @@
 Below each of these folders, only the newest holder decides what comes next:
 
     <token>/claim     the claim of a holder; its token is higher than every earlier token
-    <token>/<n>       its states, every few seconds: n = 1, 2, 3 ...
+    <token>/<n>       its states: n = 1, 2, 3 ...
 
     claim   create the claim of the highest token + 1; this fails if another process has it already: try the next one
     write   create the next state under the own token, then list the folder: if there is a claim with a higher token,

@@ -145,6 +145,28 @@ def test_a_paused_stream_uploads_nothing_and_notices_a_newer_claim(store, until,
         until(lambda: stream.report()[1])
 
 
+def test_a_state_waits_for_its_size_unless_the_stream_was_commanded_or_has_failed(store, until, monkeypatch):
+    written, checked = [], []
+    monkeypatch.setattr(Claim, "write", lambda *given, write=Claim.write: written.append(given) or write(*given))
+    monkeypatch.setattr(Claim, "check", lambda claim, check=Claim.check: checked.append(claim) or check(claim))
+    monkeypatch.setattr(module, "_CHECK_SECONDS", 0.1)
+    monkeypatch.setattr(module, "_STORE_RATE", 1.0)  # bytes per second
+    with started(StreamSpec("gate", LIVE, {"": first_box(LIVE)}), store, every=0) as stream:
+        until(lambda: written)
+        end = len(checked) + 30
+        until(lambda: len(checked) > end)
+        assert len(written) == 1
+        with control(stream.report()[0].endpoint) as controlled:
+            controlled.set_box("10,10,50,50", "other")
+        until(lambda: len(written) == 2)
+        last = stream.report()[0].frame
+        until(lambda: stream.report()[0].frame > last + 100)
+        monkeypatch.setattr(stream, "_take", lambda *_: 1 / 0)
+        until(lambda: stream.report()[0].state == "failed")
+        until(lambda: stream.report()[0].token == 2)
+        assert Store(store).stream("gate").newest().facts["frame"] > last + 100
+
+
 def test_a_stream_that_has_lost_its_source_says_so(store, camera, demo_video, until):
     path, boxes = demo_video(FRAMES)
     with open_source(path) as film:

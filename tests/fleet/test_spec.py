@@ -117,7 +117,7 @@ def test_the_digest_changes_exactly_if_the_stream_must_be_started_anew(change, r
         ("[streams]\ncam-7 = 3", "the stream cam-7: expected a table with a source, got 3: write [streams.cam-7]"),
         ('[streams."cam 7"]\nsource="0"', "'cam 7' is not a valid name of a stream: expected 1 to 64 letters"),
         ('naem="a"\n[streams.a]\nsource="0"', "there is no key 'naem', did you mean 'name'? there are name, store"),
-        ('every=0\n[streams.a]\nsource="0"', "every must be a number of seconds above 0 and at most 3600, got 0"),
+        ('every=-1\n[streams.a]\nsource="0"', "every must be a number of seconds from 0 to 3600, got -1"),
     ],
 )  # fmt: skip
 def test_an_error_of_the_file_is_one_line(load, lines, error, tmp_path):
@@ -166,7 +166,7 @@ def test_the_changes_of_a_new_spec_have_a_line_for_each_stream():
     ]
 
 
-@pytest.mark.parametrize("data", [b"", b"{}", b'{"name": "a", "every": 0}'])
+@pytest.mark.parametrize("data", [b"", b"{}", b'{"name": "a", "every": -1}'])
 def test_a_stored_state_that_is_damaged_is_an_error(data):
     with pytest.raises(FleetError, match="are damaged: apply the fleet file again"):
         from_json(data)
