@@ -60,7 +60,7 @@ class CompressorLoop:
         self._forest.skip_to(process.job.first)
         seq = self._forest.seq
         self._position = Position(seq, seq, versions=self._forest.versions)
-        self._tried, self._took = monotonic(), 0.0  # when the last checkpoint was written, and for how long
+        self._tried, self._took = monotonic(), 0.0  # when the last checkpoint was tried; duration of one without sync
         self._sync_at = 0.0  # when the next one is durable
         check, states, window = self._check, self._forest.states_at, settings.run.unstored_frames
         self._features = stack.enter_context(Receiver(ALL_FEATURES, endpoint, self._position, window, check, states))
@@ -117,11 +117,12 @@ class CompressorLoop:
         began = monotonic()
         durable = self._process.job.state is not None and (is_end or began >= self._sync_at)
         saved = self._checkpoints.save(self._forest, durable=durable)
-        if saved and durable:
-            self._sync_at = began + sync_interval(self._checkpoints.size)
-        self._position = stored(self._position, self._forest.seq, saved=saved, urgent=urgent)
         self._tried = monotonic()
-        self._took = self._tried - began
+        if saved and durable:  # its duration does not count: the next one is not synced
+            self._sync_at = began + sync_interval(self._checkpoints.size)
+        else:
+            self._took = self._tried - began
+        self._position = stored(self._position, self._forest.seq, saved=saved, urgent=urgent)
 
     def publish(self, end: End | None) -> None:
         """Serve late joiners, send the trees and the end to subscribers, and publish the health."""

@@ -183,7 +183,7 @@ class TrainingLag:
 
 
 def checkpoint_is_due(since: float, took: float, interval: float) -> bool:
-    """Return True if the interval is over, `since` seconds after the last checkpoint was tried, which `took` seconds.
+    """Return True if the interval is over, `since` seconds after the last checkpoint; one takes `took` seconds.
 
     It grows with the trees: at most a tenth of the time is spent.
 
