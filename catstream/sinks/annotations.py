@@ -1,8 +1,8 @@
 """Formats of annotation tools and data sets, made from a log: COCO, CVAT for video, YOLO and VIA tracks.
 
 Frames have their numbers in the source. The image of a frame is NAME_000000.jpg, with the name of the log and the
-number of the frame; an image of a folder keeps its name. A doubtful box is marked, except in YOLO, which has no field
-for it; CVAT also has `checked` of an annotation.
+number of the frame; an image of a folder keeps its name, after NAME_ in a data set of several logs. A doubtful box is
+marked, except in YOLO, which has no field for it; CVAT also has `checked` of an annotation.
 """
 
 from __future__ import annotations
@@ -60,6 +60,7 @@ class About:
     label    class of all objects; empty if the name of each is its class
     classes  names of the classes in the order of their numbers; empty for the order of the log
     images   files of the images of the source; empty if it is a video
+    prefix   of the names of these images: those of several logs may be the same
     source   path of the source whose images are written; empty to write none
     is_first whether this is the first log of a data set: the labels of an earlier one are removed
     """
@@ -71,6 +72,7 @@ class About:
     label: str = ""
     classes: Sequence[str] = ()
     images: Sequence[Path] = ()
+    prefix: str = ""
     source: str = ""
     is_first: bool = True
 
@@ -257,4 +259,4 @@ def _image(about: About, frame: int) -> str:
     if frame >= len(about.images):
         count = counted(len(about.images), "image")
         raise VideoError(f"the log has frame {frame}, but its folder has {count}: pass another one (--source)")
-    return about.images[frame].name
+    return about.prefix + about.images[frame].name

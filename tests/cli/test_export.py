@@ -1,11 +1,17 @@
 """`catstream export`: other formats from the log of a run."""
 
 import json
+import shutil
 import sqlite3
 from contextlib import closing
+from pathlib import Path
 
 import cv2
 import pytest
+
+from catstream.base.box import Box
+from catstream.messages.kinds import Track
+from catstream.sinks.destinations import Head
 
 
 def test_other_formats_are_made_from_the_log_of_a_run(whole_run, video, succeed, fail, tmp_path):
@@ -71,3 +77,17 @@ def test_the_images_of_a_data_set_are_those_of_the_tracked_frames(whole_run, suc
 def test_a_source_with_frames_of_another_size_is_an_error(whole_run, fail, tmp_path):
     log, annotated = whole_run / "out" / "demo.ndjson", whole_run / "out" / "demo.mp4"
     assert "has frames of (320, 240), not" in fail("export", log, tmp_path / "t.json", "--source", annotated)
+
+
+def test_images_of_several_folders_with_the_same_names_are_all_in_the_data_set(walk, succeed, tmp_path):
+    for name in ("monday", "tuesday"):
+        shutil.copytree(walk / "img", tmp_path / name)
+        track = Track(0, 0.0, "present", Box(10, 20, 30, 40), 0.9, 1, object="anna")
+        head = Head(source=str(tmp_path / name), size=(320, 240))
+        (tmp_path / f"{name}.ndjson").write_text(f"{head.to_json()}\n{json.dumps(track.to_dict())}\n")
+    succeed("export", tmp_path, tmp_path / "set", "--format", "yolo", "--images")
+    first = min(file.name for file in (walk / "img").iterdir())
+    images = {file.name for file in (tmp_path / "set" / "images").iterdir()}
+    assert images == {f"monday_{first}", f"tuesday_{first}"}
+    labels = {file.stem for file in (tmp_path / "set" / "labels").iterdir()}
+    assert labels == {Path(name).stem for name in images}
