@@ -89,7 +89,7 @@ def batch(
     click.get_current_context().with_resource(locked_folder(output, VideoError))
     batch = Batch(videos, output, overwrite=overwrite)
     jobs, total, console = jobs or cores(), len(batch.missing), messages()
-    if not console.is_terminal:
+    if not console.is_interactive:
         console.print(f"tracking {counted(total, 'video')}, {len(videos) - total} complete")
     began = time.monotonic()
     try:
@@ -97,7 +97,7 @@ def batch(
             task = progress.add_task("tracking", total=total)
             for done, row in enumerate(tracked, 1):
                 progress.update(task, advance=1, description=row.video)
-                if not console.is_terminal:
+                if not console.is_interactive:
                     left = timedelta(seconds=round((time.monotonic() - began) / done * (total - done)))
                     result = (
                         row.error or f"{counted(row.frames, 'frame')}, {row.present / max(row.tracks, 1):.0%} present"

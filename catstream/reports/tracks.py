@@ -76,7 +76,7 @@ class _Object:
         self.frames = np.array([track.source_frame for track in tracks])
         self.times: Float64 = np.array([track.time for track in tracks])
         intervals = np.diff(self.times)
-        self.interval = float(np.median(intervals)) if len(intervals) else 1 / rate
+        self.interval = float(np.median(intervals) if len(intervals) else 0) or 1 / rate
         self.gaps = intervals > max(_GAP_SECONDS, 5 * self.interval)
         self.ends = self.times + np.append(np.where(self.gaps, self.interval, intervals), self.interval)
         boxes = np.array([track.box or [np.nan] * 4 for track in tracks], np.float64)
@@ -101,7 +101,7 @@ class _Object:
         shares = [float(np.mean(self.states == state)) for state in ("present", "doubtful", "absent")]
         seconds = (self.ends - self.times)[self.states != "absent"].sum()
         mean = fastest = distance / (tracked or np.nan)
-        if (window := max(1, round(_SPEED_SECONDS / self.interval))) < len(self.steps):
+        if tracked and (window := max(1, round(_SPEED_SECONDS / self.interval))) < len(self.steps):
             sums = (np.convolve(values, np.ones(window), "valid") for values in (self.steps, np.diff(self.times)))
             fastest = np.fmax.reduce(np.divide(*sums), initial=mean)
         return [len(self.states), *shares, self._checked, seconds, distance, mean, fastest]
