@@ -160,7 +160,8 @@ def parse(values: Mapping[str, Any], places: Sequence[str], name_of: Callable[[s
         option = OPTIONS[name]
         if kinds.isdisjoint(option.users):
             users = " or ".join(option.users)
-            raise SettingsError(f"{name_of(name)} has no effect on these destinations: omit it, or add {users}")
+            always = " (a folder always has pictures)" if name == "picture" and "/" in kinds else ""
+            raise SettingsError(f"{name_of(name)} has no effect on these destinations{always}: omit it, or add {users}")
         with _errors_of(name_of(name)):
             try:
                 fields[name] = option.convert(msgspec.convert(value, option.kind, strict=False))

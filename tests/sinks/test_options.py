@@ -57,7 +57,8 @@ def test_an_invalid_value_is_an_error(values, error):
     ("place", "values", "error"),
     [
         ("t.csv", {"when": "lost=10"}, "when has no effect on these destinations: omit it, or add mqtt://"),
-        ("t.csv", {"picture": True}, "picture has no effect"),
+        ("t.csv", {"picture": True}, "picture has no effect on these destinations: omit it"),
+        ("events/", {"picture": True}, r"picture has no effect .* \(a folder always has pictures\): omit it"),
         ("t.csv", {"zone": DOOR}, "zone has no effect on these destinations"),
         (HOOK, {"rate": "5"}, "rate has no effect on these destinations: omit it, or add mqtt:// or mqtts://"),
         (YARD, {"secret_file": "key"}, "secret_file has no effect .* http:// or https://"),
