@@ -68,7 +68,7 @@ with_address = combined(
 )
 
 with_wait = click.option(
-    "--wait", default=30.0, show_default=True, type=NumberRange(0), help="Seconds to wait for the pipeline."
+    "--wait", default=30.0, show_default=True, type=NumberRange(0), help="Seconds to wait for a pipeline at --endpoint."
 )
 
 
@@ -284,7 +284,7 @@ def resume(pipeline: Control) -> str:
 @click.command()
 @click.argument("file", type=PATH)
 @click.option("--object", "name", default=UNNAMED, metavar="NAME", help="Name of the object; default: the only one.")
-@click.option("--state", type=FOLDER, metavar="FOLDER", help="State folder of a run, which may have ended.")
+@click.option("--state", type=FOLDER, metavar="DIR", help="State folder of a run, which may have ended.")
 @with_overwrite
 @with_address
 @_with_timeout
