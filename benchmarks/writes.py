@@ -15,11 +15,12 @@ import argparse
 import signal
 import subprocess
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import replace
 from itertools import cycle
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from unittest.mock import patch
 
 import cv2
 import numpy as np
@@ -27,17 +28,15 @@ from resume import TRACK, written
 from table import Cell, Table, benchmark, command
 
 from catstream.compression.checkpoint_store import CheckpointStore
-from catstream.compression.compressor import Compressor
+from catstream.compression.forest import Forest
 from catstream.jobs.state import CHECKPOINTS
 from catstream.loadtest.camera import Camera, Schedule
 from catstream.loadtest.load import render
 from catstream.loadtest.result import Plan
-from catstream.messages.kinds import Features, Tracks
 from catstream.multi import MultiTracker
 from catstream.processes.decisions import sync_interval
 
 _MARKS = (1_000, 10_000, 25_000, 50_000, 100_000)
-_COUNTS = ("write_bytes", "cancelled_write_bytes", "wchar")
 
 
 def figures(options: argparse.Namespace) -> Iterator[Table]:
@@ -74,35 +73,23 @@ def camera(objects: int, seconds: float) -> tuple[Cell, ...]:
         return objects, frames, *rates, disk / frames / 1e3, newest.stat().st_size / 1e6
 
 
-class Recorder(MultiTracker):
-    """A tracker that keeps the features of all frames."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.features: list[Features] = []
-
-    def _train(self, tracks: Tracks, features: Features, *continued: Mapping[str, Compressor]) -> None:
-        self.features.append(features)
-        super()._train(tracks, features, *continued)
-
-
 def growth(objects: int, marks: list[int]) -> Iterator[tuple[Cell, ...]]:
     """Insert the features of a video again and again, save checkpoints as a compressor does, and yield rows of figures.
 
     A second has 25 frames, however long they take.
     """
-    tracker, plan = Recorder(), Plan(objects=objects, size=(640, 480), duration=min(marks[-1] / 25, 10))
+    tracker, plan = MultiTracker(), Plan(objects=objects, size=(640, 480), duration=min(marks[-1] / 25, 10))
     video = render(plan, lambda *_: None)
-    for number, unit in enumerate(video.units):
-        image = cv2.imdecode(np.frombuffer(unit, np.uint8), cv2.IMREAD_COLOR)
-        tracker.update(image) if number else tracker.init(image, video.boxes)
-    features, interval = cycle(tracker.features[1:]), tracker.settings.run.checkpoint_seconds
-    forest, last, sync_at, before = tracker.forest, 0, 0.0, counts()
-    first = forest.seq
+    with patch.object(Forest, "take", autospec=True, side_effect=Forest.take) as take:
+        for number, unit in enumerate(video.units):
+            image = cv2.imdecode(np.frombuffer(unit, np.uint8), cv2.IMREAD_COLOR)
+            tracker.update(image) if number else tracker.init(image, video.boxes)
+    features, interval = cycle(call.args[1] for call in take.mock_calls[1:]), tracker.settings.run.checkpoint_seconds
+    forest, first, last, sync_at, before = tracker.forest, tracker.forest.frame, 0, 0.0, counts()
     with TemporaryDirectory(prefix="catstream-writes-") as place:
         store = CheckpointStore(place)
         for number in range(1, marks[-1] + 1):
-            forest.take(replace(next(features), frame=first + number - 1))
+            forest.take(replace(next(features), frame=first + number))
             second = number / plan.rate
             if number % (interval * plan.rate) == 0:
                 store.save(forest, durable=second >= sync_at)
@@ -114,9 +101,9 @@ def growth(objects: int, marks: list[int]) -> Iterator[tuple[Cell, ...]]:
 
 
 def counts() -> np.ndarray:
-    """Return the `_COUNTS` of this process and of its children that have ended."""
+    """Return dirtied, cancelled and logical bytes of this process and of its children that have ended."""
     lines = dict(line.split(": ") for line in Path("/proc/self/io").read_text().splitlines())
-    return np.array([int(lines[name]) for name in _COUNTS])
+    return np.array([int(lines[name]) for name in ("write_bytes", "cancelled_write_bytes", "wchar")])
 
 
 if __name__ == "__main__":
