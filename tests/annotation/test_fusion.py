@@ -53,6 +53,17 @@ def test_a_pass_that_arrives_at_the_other_keyframe_wins_beyond_the_middle():
     assert boxes[:7, 0].tolist() == [10.0] * 7
 
 
+def test_a_pass_that_lost_the_object_and_found_it_again_has_less_weight_where_it_was_lost():
+    found = forward(*[LEFT] * 2, *[RIGHT] * 4, *[LEFT] * 4)
+    boxes, _, _ = fused(found, backward(LEFT), drawn={0: LEFT, 10: LEFT})
+    assert boxes[:, 0].tolist() == [10.0] * 9
+
+
+def test_the_score_of_a_single_direction_decides_how_probable_its_boxes_are():
+    low, high, highest = (fused(forward(LEFT, score=score), drawn={0: LEFT})[1].max() for score in (0.3, 0.9, 3.0))
+    assert low < high < highest < 0.97
+
+
 def test_frames_beside_a_disagreement_are_less_probable():
     lost = backward(*[LEFT] * 5, RIGHT, *[LEFT] * 4)  # in frame 4
     probabilities = fused(forward(LEFT), lost, drawn={0: LEFT, 10: LEFT})[1]
