@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
 from contextlib import closing
 from dataclasses import dataclass, field
-from itertools import chain, pairwise
+from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple, Self, cast
 
@@ -16,6 +16,7 @@ import numpy as np
 
 from catstream.annotation.fusion import fuse
 from catstream.annotation.keyframes import HIDDEN, KeyframeBox, parse_box
+from catstream.annotation.object_tracks import CHECKED, ObjectTracks
 from catstream.annotation.passes import Pass, box_of, row_of, run_pass
 from catstream.base.addresses import is_live, without_password
 from catstream.base.arrays import Float64
@@ -26,7 +27,7 @@ from catstream.base.text import listed
 from catstream.base.threads import cores
 from catstream.base.workers import Workers
 from catstream.errors import BoxError, ObjectError, VideoError
-from catstream.messages.kinds import Check, Track
+from catstream.messages.kinds import Check
 from catstream.video.source import ALL_FRAMES
 from catstream.video.video_frames import VideoFrames
 
@@ -37,8 +38,6 @@ Progress = Callable[[str, int, int | None], object]
 #: box: of one object without a name, or by name.
 _BoxesByFrame = Mapping[int, str | Iterable[float] | None]
 KeyframeBoxes = _BoxesByFrame | Mapping[str, _BoxesByFrame]
-
-_CHECKED = 0.97  #: probability from which a frame is checked
 
 
 class NextFrame(NamedTuple):
@@ -131,6 +130,7 @@ class Annotation:
             redacted = without_password(os.fspath(video))
             raise VideoError(f"cannot annotate a live source ({redacted}): record it to a file first")
         self._passes: dict[Task, Pass | None] = {}  # None if it cannot start
+        self._fusions: dict[_Stretch, tuple[Float64, Float64, Float64]] = {}  # what is known of them, fused
         self._workers = Workers(self._jobs)
         self._folder = tempfile.TemporaryDirectory(prefix="catstream-annotate-", ignore_cleanup_errors=True)
         try:
@@ -172,6 +172,9 @@ class Annotation:
         parsed = _parsed(boxes)
         check_count(len(parsed), self.settings.run.max_objects)
         self._check(parsed)
+        for stretch in [*self._fusions]:
+            if parsed.get(stretch.object) != self.keyframes[stretch.object]:
+                del self._fusions[stretch]
         self.keyframes: dict[str, dict[int, KeyframeBox]] = parsed
         self._drawn = {
             name: {frame: box for frame, box in boxes.items() if box != HIDDEN} for name, boxes in parsed.items()
@@ -189,6 +192,7 @@ class Annotation:
         if exact or not self._is_scanned:
             self._is_scanned = True
             self._passes.clear()
+            self._fusions.clear()
             self.progress("reading", len(self.frames), None)
             self.frames.scan(lambda *done: self.progress("reading", *done), exact=exact)
         self._check(self.keyframes)
@@ -203,7 +207,7 @@ class Annotation:
             try:
                 with closing(results):
                     for task, one in results:
-                        self._passes[task] = one
+                        self._insert(task, one)
                         finished += task.frames
                         self.progress("tracking again" if task.use_memory else "tracking", finished, total)
             except VideoError:
@@ -240,24 +244,23 @@ class Annotation:
 
         VideoError if a frame could not be decoded.
         """
-        task, one = self._workers.result(future)
-        self._passes[task] = one
+        self._insert(*self._workers.result(future))
 
     @property
-    def tracks(self) -> dict[str, list[Track]]:
+    def tracks(self) -> dict[str, ObjectTracks]:
         """The track of each object in all frames, by name, with `checked` and `probability`; doubtful if unchecked."""
-        return {name: [*self._tracks(name)] for name in self.keyframes}
+        return {name: self._tracks(name) for name in self.keyframes}
 
     @property
     def checked(self) -> dict[str, list[Check]]:
         """The check of each frame (keyframe, hidden, checked or unchecked), by the name of the object."""
-        return {name: [track.checked for track in tracks] for name, tracks in self.tracks.items()}
+        return {name: [*map(tracks.check, range(len(tracks)))] for name, tracks in self.tracks.items()}
 
     @property
     def share_checked(self) -> float:
         """Share of frames that are not unchecked, over all objects, from 0 to 1."""
-        checks = [*chain.from_iterable(self.checked.values())]
-        return 1 - checks.count("unchecked") / len(checks) if checks else 0.0
+        unchecked = [tracks.unchecked for tracks in self.tracks.values()]
+        return 1 - float(np.mean(unchecked)) if unchecked else 0.0
 
     def passes(self, name: str = UNNAMED) -> list[Pass]:
         """The finished passes of an object, in the order of their keyframes: the proposals for its unchecked frames."""
@@ -332,7 +335,7 @@ class Annotation:
                 tasks.append(task)
         return tasks
 
-    def _tracks(self, name: str) -> Iterator[Track]:
+    def _tracks(self, name: str) -> ObjectTracks:
         drawn, count = self._drawn[name], len(self.frames)
         boxes, probabilities, scores = np.full((count, 4), np.nan), np.ones(count), np.ones(count)
         for frame, box in drawn.items():
@@ -341,19 +344,7 @@ class Annotation:
             if stretch.object == name:
                 part = slice(stretch.start, stretch.stop)
                 boxes[part], probabilities[part], scores[part] = self._fused(stretch)
-        for frame, (row, probability, score) in enumerate(zip(boxes, probabilities, scores, strict=True)):
-            box, doubtful = box_of(row), bool(probability < _CHECKED)
-            check: Check = "unchecked" if doubtful else "checked"
-            if frame in self.keyframes[name]:
-                check = "keyframe" if frame in drawn else HIDDEN
-            yield Track(
-                *(frame, float(self.frames.times[frame]), "absent" if box is None else "present", box, float(score)),
-                model_version=0,
-                object=name,
-                doubtful=doubtful,
-                checked=check,
-                probability=float(probability),
-            )
+        return ObjectTracks(name, self.keyframes[name], self.frames.times, boxes, probabilities, scores)
 
     def _parts(self, stretch: _Stretch) -> list[Pass]:
         """The parts of the finished passes that run over a stretch."""
@@ -362,7 +353,17 @@ class Annotation:
         return [part for part in parts if part is not None]
 
     def _fused(self, stretch: _Stretch) -> tuple[Float64, Float64, Float64]:
-        return fuse(self._parts(stretch), stretch.start, stretch.stop, self._drawn[stretch.object])
+        if stretch not in self._fusions:
+            fused = fuse(self._parts(stretch), stretch.start, stretch.stop, self._drawn[stretch.object])
+            self._fusions[stretch] = fused
+        return self._fusions[stretch]
+
+    def _insert(self, task: Task, one: Pass | None) -> None:
+        self._passes[task] = one
+        first, last = sorted((task.start, task.stop))
+        for stretch in [*self._fusions]:
+            if stretch.start <= last and first < stretch.stop:
+                del self._fusions[stretch]
 
     def _hidden(self, stretch: _Stretch) -> list[int]:
         """The frames of a stretch in which the object is hidden, counted from its start."""
@@ -370,7 +371,7 @@ class Annotation:
         return sorted(frame - stretch.start for frame in hidden if stretch.start <= frame < stretch.stop)
 
     def _is_checked(self, stretch: _Stretch) -> bool:
-        unchecked = self._fused(stretch)[1] < _CHECKED
+        unchecked = self._fused(stretch)[1] < CHECKED
         unchecked[self._hidden(stretch)] = False
         return not unchecked.any()
 

@@ -10,10 +10,10 @@ from typing import Any, Self
 
 from catstream.annotation.annotation import Annotation, NextFrame, Task
 from catstream.annotation.keyframes import KeyframeBox
+from catstream.annotation.object_tracks import ObjectTracks
 from catstream.base.arrays import UInt8
 from catstream.base.box import Box
 from catstream.errors import CatstreamError, CommandRejectedError, ObjectError, VideoError
-from catstream.messages.kinds import Track
 
 #: Passes of more frames have processes of their own, so that a correction of a short stretch does not wait for them.
 _LONG = 600
@@ -55,7 +55,7 @@ class Session:
     ) -> None:
         self.annotation, self._jobs, self._save, self._write = annotation, jobs, save, write
         self.revision, self.decoded = 0, False
-        self.tracks: dict[str, list[Track]] = {}
+        self.tracks: dict[str, ObjectTracks] = {}
         self.next_frames: list[NextFrame] = []
         self.problem: CatstreamError | None = None
         self.finished, self.lock = threading.Event(), threading.Condition(threading.RLock())

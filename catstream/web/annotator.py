@@ -1,7 +1,7 @@
 """The web application of `catstream annotate`: a page that shows a session, and changes its boxes.
 
 /                the page
-/events          the state of the session as server-sent events, at most ten per second
+/events          the state of the session, and what changes in it, as server-sent events, at most ten per second
 /frames/N.jpg    the picture of a frame, scaled down if it is large; /frames/N.jpg?full has all pixels
 /frames/N        its size, and what the passes say about the objects in it
 /edit            POST a change: the fields of `Edit`
@@ -10,12 +10,12 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator
 from dataclasses import dataclass
-from itertools import groupby
 from secrets import token_hex
 from typing import Literal
 
+import numpy as np
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
@@ -26,14 +26,15 @@ from starlette.staticfiles import StaticFiles
 
 from catstream.annotation.keyframes import HIDDEN
 from catstream.annotation.session import Session
+from catstream.base.arrays import Bool
 from catstream.base.box import Box
 from catstream.base.names import check_name
 from catstream.errors import CatstreamError, CommandRejectedError
-from catstream.messages.kinds import Track
 from catstream.video.drawing import PALETTE
 from catstream.video.frames import describe_counters, jpeg
 from catstream.web.app import PAGE, UPDATE_SECONDS, endless, event, failed, json_of
 
+_PARTS = 2000  #: of a timeline, which is not wider in pixels
 _SIDE = 1920  #: longest side of a picture in pixels; a larger frame is scaled down
 
 
@@ -42,6 +43,8 @@ class AnnotationSite:
 
     def __init__(self, session: Session) -> None:
         self._session, self._closed = session, False
+        self._objects_state: tuple[int, int] | None = None  # of which `_objects` are
+        self._objects: list[dict[str, object]] = []
         self._id = token_hex(8)  # a tab of an earlier server at the same port has another one
         routes = [
             Route("/", lambda _: FileResponse(PAGE / "annotate.html")),
@@ -67,7 +70,7 @@ class AnnotationSite:
         objects = {}
         with session.lock:
             for name, drawn in session.annotation.keyframes.items():
-                track = next(iter(session.tracks.get(name, [])[number : number + 1]), None)
+                track = session.tracks[name][number] if name in session.tracks else None
                 box = track.box if track else None
                 answer = drawn.get(number, box)
                 check = track.checked if track else "unchecked"
@@ -106,43 +109,53 @@ class AnnotationSite:
         return {}
 
     async def _states(self) -> AsyncIterator[str]:
-        """Yield the state whenever it has changed, as server-sent events."""
-        last = None
+        """Yield the state, and then the values that have changed, as server-sent events."""
+        shown: dict[str, object] = {}
         while not self._closed:
             state = await run_in_threadpool(self._state)
-            if state != last:
-                yield event(state)
-            last = state
+            if changed := {key: value for key, value in state.items() if key not in shown or shown[key] != value}:
+                yield event(changed)
+            shown = state
             await asyncio.sleep(UPDATE_SECONDS)
         yield event({"closed": True})
 
     def _state(self) -> dict[str, object]:
         session, frames = self._session, self._session.annotation.frames
         with session.lock:
-            objects = [
-                {
-                    "name": name,
-                    "colour": PALETTE[number % len(PALETTE)],
-                    "keyframes": sorted(drawn),
-                    "unchecked": [*_unchecked(session.tracks[name])]
-                    if name in session.tracks
-                    else [(0, len(frames) - 1)],
-                }
-                for number, (name, drawn) in enumerate(session.annotation.keyframes.items())
-            ]
+            state = (session.revision, len(frames))
+            if state != self._objects_state:
+                self._objects_state, self._objects = state, self._described()
         return {
             "server": self._id,
             "video": frames.name,
             "videos": session.annotation.videos,
             "frames": len(frames),
             "decoded": session.decoded,
-            "objects": objects,
+            "objects": self._objects,
             "next": [*session.next_frames[:99]],
             "remaining": session.remaining(),
             "revision": session.revision,
             "undo": session.can_undo,
             "problem": str(session.problem or ", ".join(describe_counters(session.annotation.counters))),
         }
+
+    def _described(self) -> list[dict[str, object]]:
+        """The objects with their keyframes, the number of unchecked frames, and where these are."""
+        objects: list[dict[str, object]] = []
+        for name, drawn in self._session.annotation.keyframes.items():
+            unchecked = np.ones(len(self._session.annotation.frames), bool)
+            if name in self._session.tracks:
+                unchecked = self._session.tracks[name].unchecked
+            objects.append(
+                {
+                    "name": name,
+                    "colour": PALETTE[len(objects) % len(PALETTE)],
+                    "keyframes": sorted(drawn),
+                    "wrong": int(unchecked.sum()),
+                    "unchecked": _runs(unchecked),
+                }
+            )
+        return objects
 
 
 @dataclass(frozen=True, slots=True)
@@ -170,9 +183,9 @@ def _rounded(box: Box | None) -> list[float] | None:
     return box and [round(side, 1) for side in box]
 
 
-def _unchecked(tracks: list[Track]) -> Iterator[tuple[int, int]]:
-    """Yield the first and the last number of neighbouring frames that are not checked."""
-    for check, group in groupby(tracks, key=lambda track: track.checked):
-        if check == "unchecked":
-            frames = [track.frame for track in group]
-            yield frames[0], frames[-1]
+def _runs(mask: Bool) -> list[tuple[int, int]]:
+    """The first and the last number of neighbouring frames with True, in a long video rounded to parts of it."""
+    part = -(-len(mask) // _PARTS) or 1
+    parts = np.pad(mask, (0, -len(mask) % part)).reshape(-1, part).any(axis=1)
+    edges = np.flatnonzero(np.diff(np.pad(parts, 1)))
+    return [(part * int(start), min(part * int(stop), len(mask)) - 1) for start, stop in edges.reshape(-1, 2)]

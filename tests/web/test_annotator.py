@@ -11,6 +11,7 @@ import pytest
 
 from catstream.annotation.annotation import Annotation
 from catstream.annotation.session import Session
+from catstream.web import annotator as module
 from catstream.web.annotator import AnnotationSite
 
 FRAMES = 12
@@ -151,3 +152,15 @@ def test_command_continues_where_it_was_interrupted_until_it_is_done(serving, de
         assert process.wait(150) == 0
         assert "2 keyframes" in process.stdout.read()
     assert len((tmp_path / "out" / "demo.csv").read_text().splitlines()) == FRAMES + 1
+
+
+def test_only_what_has_changed_is_sent_and_timelines_are_bounded(session, edit, page, demo, until, monkeypatch):
+    monkeypatch.setattr(module, "_PARTS", 5)
+    assert module._runs(np.array([True] * 3 + [False] * 9 + [True] * 11)) == [(0, 4), (10, 22)]
+    edit("draw", object="anna", frame=0, box=[*demo[1][0]])
+    until(lambda: not session.remaining())
+    with page.stream("GET", "/events") as events:
+        states = (json.loads(line.removeprefix("data: ")) for line in events.iter_lines() if line.startswith("data: "))
+        assert next(states)["objects"][0]["wrong"] == len(demo[1]) - 1
+        session.rename("anna", "ben")
+        assert {"server", "video", "frames"}.isdisjoint(next(states))

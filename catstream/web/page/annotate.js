@@ -41,8 +41,9 @@ class AnnotatePage {
     this.choose(null);
   }
 
-  /** Show another state of the server, or that it has ended. */
-  receive({ closed, ...state }) {
+  /** Show what has changed on the server, or that it has ended. */
+  receive({ closed, ...changes }) {
+    const state = { ...this.state, ...changes };
     if (!closed && this.state && state.server !== this.state.server) return this.end("Another command serves this address now: reload the page.");
     this.silent = Boolean(closed);
     if (!closed) {
@@ -292,7 +293,7 @@ class AnnotatePage {
     return { element, choose, line, share: add(element, "span", { className: "share number" }) };
   }
 
-  fillRow({ element, choose, line, share }, { name, colour, keyframes, unchecked, frames, frame, chosen, several }) {
+  fillRow({ element, choose, line, share }, { name, colour, keyframes, wrong, unchecked, frames, frame, chosen, several }) {
     element.style.setProperty("--colour", colour);
     choose.setAttribute("aria-pressed", String(chosen));
     const bar = (kind, first, last) => make("rect", { class: kind, x: first, width: last - first + 1, y: 1, height: 3 });
@@ -300,7 +301,6 @@ class AnnotatePage {
     line.setAttribute("viewBox", `0 0 ${frames} 5`);
     line.replaceChildren(bar("right", 0, frames - 1), ...unchecked.map(([first, last]) => bar("wrong", first, last)),
       mark("now", frame), ...keyframes.map((place) => mark("", place)));
-    const wrong = unchecked.reduce((sum, [first, last]) => sum + last - first + 1, 0);
     const percent = Math.floor(100 * (1 - wrong / frames));
     write(share, `${percent}%`);
     line.setAttribute("aria-label", `${name}: ${many(keyframes.length, "box", "boxes")}, ${percent} % of the ${several ? "videos" : "frames checked"}`);
