@@ -382,9 +382,28 @@ def disk(request, tmp_path):
     mount = ["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", folder]
     done = subprocess.run(mount, capture_output=True, text=True, check=False)
     if done.returncode:
-        pytest.skip(f"only root may mount a small disk, and where a tmpfs can be: {done.stderr.strip()}")
+        pytest.skip(f"only root may mount a small disk, for example in `unshare -rm pytest`: {done.stderr.strip()}")
     yield folder
     subprocess.run(["umount", "--lazy", folder], check=True)
+
+
+@pytest.fixture
+def remount(disk):
+    """Makes the disk read-only ("ro") or writable ("rw")."""
+    return lambda option: subprocess.run(["mount", "-o", f"remount,bind,{option}", disk], check=True)
+
+
+@pytest.fixture
+def fill(disk):
+    """Fills the disk: the file to remove."""
+
+    def now():
+        with (disk / "ballast").open("ab", buffering=0) as ballast, suppress(OSError):
+            while True:
+                ballast.write(bytes(4096))
+        return disk / "ballast"
+
+    return now
 
 
 @pytest.fixture

@@ -26,6 +26,14 @@ except ImportError:  # Windows
 
 ABANDONED_SECONDS = 600.0  #: after which nothing writes a part of a file any more
 
+#: Errors of a disk that may pass -> what to do.
+REMEDIES = {
+    errno.ENOSPC: "free space on the disk",
+    errno.EDQUOT: "free space, or raise the quota",
+    errno.EROFS: "mount it writable",
+    errno.EIO: "check the disk",
+}
+
 
 def state_home() -> Path:
     """The folder for files of this user that outlive a process; ServiceError if the user has no home directory."""
@@ -91,28 +99,36 @@ def writing(path: str | os.PathLike[str], kind: type[CatstreamError] = ServiceEr
     except BrokenPipeError:  # the reader of standard output has ended, as `head` does: not an error of catstream
         raise
     except OSError as error:
-        raise kind(f"cannot write {os.fspath(path)!r} ({error.strerror}): use another folder") from None
+        remedy = REMEDIES.get(error.errno or 0, "use another folder")
+        raise kind(f"cannot write {os.fspath(path)!r} ({error.strerror}): {remedy}") from None
 
 
 def check_file(
-    path: Path, *, overwrite: bool = True, made: Path | None = None, kind: type[CatstreamError] = ServiceError
+    path: Path,
+    *,
+    overwrite: bool = True,
+    made: Path | None = None,
+    kind: type[CatstreamError] = ServiceError,
+    may_wait: bool = False,
 ) -> None:
     """Raise an error of this kind if a file exists and may not be replaced, or cannot be written.
 
-    The folder `made` is made before the file, if it does not exist.
+    The folder `made` is made before the file, if it does not exist. If the file `may_wait`, a full disk is no error.
     """
     if path.exists() and not overwrite:
         raise kind(f"{path} exists already: replace it with --overwrite, or use another name")
     folder = path.parent.absolute()
     if made is not None and folder == made.absolute():
         folder = next(parent for parent in (folder, *folder.parents) if parent.exists())
+    problem, remedy = "a folder" if path.is_dir() else "", "pass a file in an existing folder that you may write to"
     try:
-        with tempfile.TemporaryFile(dir=folder):
-            is_writable = not path.is_dir()
-    except OSError:
-        is_writable = False
-    if not is_writable:
-        raise kind(f"cannot write {path}: pass a file in an existing folder that you may write to")
+        tempfile.TemporaryFile(dir=folder).close()
+    except OSError as error:
+        if error.errno in REMEDIES and may_wait:
+            return
+        problem, remedy = error.strerror or "", REMEDIES.get(error.errno or 0, remedy)
+    if problem:
+        raise kind(f"cannot write {path} ({problem}): {remedy}")
 
 
 @contextlib.contextmanager

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import errno
 import logging
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TypeVar
 
+from catstream.base.files import REMEDIES, sync
 from catstream.base.settings import Settings
 from catstream.compression.forest import Forest
 from catstream.errors import ProtocolError
@@ -25,10 +27,12 @@ class CheckpointStore:
 
     A checkpoint is written atomically. A durable one is on disk before `save` returns. The others survive `kill -9`,
     but not a power cut: the kernel writes a file to disk after about 30 s, and they are removed before. No file is
-    overwritten: an older checkpoint is removed after a newer one is complete.
+    overwritten: an older checkpoint is removed after a newer one is complete. If the disk is full, the older ones are
+    removed before, but never the newest valid one.
 
-    size     bytes of the newest checkpoint that this store has written
-    trouble  current problems
+    size           bytes of the newest checkpoint that this store has written
+    write_problem  why the last checkpoint could not be written; empty if it was
+    trouble        current problems
     """
 
     def __init__(self, folder: str | os.PathLike[str]) -> None:
@@ -37,11 +41,11 @@ class CheckpointStore:
         self.size = 0
         self._damaged: list[Path] = []
         self._read_problem = ""  # why checkpoints were not used
-        self._write_problem = ""  # why the last checkpoint could not be written
+        self.write_problem = ""
 
     @property
     def trouble(self) -> str:
-        return "; ".join(filter(None, (self._write_problem, self._read_problem)))
+        return "; ".join(filter(None, (self.write_problem, self._read_problem)))
 
     def load(self, settings: Settings) -> Forest:
         """A forest from the newest undamaged checkpoint, a new one if there is none.
@@ -83,14 +87,17 @@ class CheckpointStore:
             forest.save(path, durable=durable)
             self.size = path.stat().st_size
         except OSError as error:
-            problem = f"cannot write checkpoints to {self._folder} ({error.strerror})"
-            if problem != self._write_problem:
-                _log.warning("%s: training rows are in memory only; retrying", problem)
-            self._write_problem = problem
+            if error.errno in (errno.ENOSPC, errno.EDQUOT) and self._remove_oldest(files):
+                return self.save(forest, durable=durable)
+            remedy = REMEDIES.get(error.errno or 0, "make the folder writable")
+            problem = f"cannot write checkpoints to {self._folder} ({error.strerror}): {remedy}"
+            if problem != self.write_problem:
+                _log.warning("%s; training rows are in memory only", problem)
+            self.write_problem = problem
             return False
-        if self._write_problem:
+        if self.write_problem:
             _log.warning("checkpoints are written again")
-        self._write_problem = ""
+        self.write_problem = ""
         for damaged in self._damaged:
             damaged.replace(self._folder / _DAMAGED)
         self._damaged = []
@@ -98,6 +105,22 @@ class CheckpointStore:
         for old in self._files()[:-_CHECKPOINTS]:
             if old != self._durable:
                 old.unlink()
+        return True
+
+    def _remove_oldest(self, files: Sequence[Path]) -> bool:
+        """Remove a damaged checkpoint, or the oldest; return False if only the newest valid one is left."""
+        valid = [path for path in files if path not in self._damaged]
+        removable = [*self._folder.glob(_DAMAGED), *self._damaged, *valid[:-1]]
+        if not removable:
+            return False
+        try:
+            for newest in valid[-1:]:
+                sync(newest)
+                self._durable = newest
+            removable[0].unlink()
+        except OSError:
+            return False
+        self._damaged = [path for path in self._damaged if path != removable[0]]
         return True
 
     def _files(self) -> list[Path]:

@@ -9,6 +9,7 @@ import dataclasses
 import errno
 import json
 import os
+import re
 import tempfile
 import zlib
 from pathlib import Path
@@ -47,7 +48,8 @@ def write(path: str | os.PathLike[str], arrays: Arrays, metadata: Metadata, *, d
         try:
             safetensors.numpy.save_file(contiguous, part, header)
         except safetensors.SafetensorError as error:
-            raise OSError(errno.EIO, str(error)) from None
+            code = int(found[1]) if (found := re.search(r"\(os error (\d+)\)", str(error))) else errno.EIO
+            raise OSError(code, os.strerror(code)) from None
         if durable:
             sync(part)  # the content must be on disk before the new name
         part.replace(path)

@@ -108,6 +108,23 @@ def test_a_full_disk_is_reported_and_existing_checkpoints_are_kept(kept, grow, m
     assert CheckpointStore(kept).load(SETTINGS).seq == 65
 
 
+@pytest.mark.parametrize("disk", [1 << 20], indirect=True)
+def test_on_a_full_disk_older_checkpoints_make_room_for_the_next_one_but_not_the_only_one(disk, fill, grow, caplog):
+    forest, store = grow(Forest(SETTINGS), 30), CheckpointStore(disk)
+    for durable in (True, False, False):
+        assert store.save(grow(forest, 10), durable=durable)
+    fill()
+    stored = [forest.seq]
+    while store.save(grow(forest, 5), durable=False):
+        stored.append(forest.seq)
+        fill()
+    assert len(stored) > 1, "the older ones made room"
+    assert len(files(disk)) == 2, "the newest one, and the ballast"
+    assert CheckpointStore(disk).position()[0] == stored[-1]
+    assert "(No space left on device): free space on the disk" in store.trouble
+    assert len(caplog.messages) == 1
+
+
 def test_the_newest_durable_checkpoint_remains_for_a_power_cut(grow, tmp_path):
     forest, store = Forest(SETTINGS), CheckpointStore(tmp_path)
     for durable in (True, False, True, False, False, False):
