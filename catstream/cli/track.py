@@ -31,7 +31,6 @@ from catstream.cli.options import (
 from catstream.cli.progress import REFRESH_SECONDS, RunProgress
 from catstream.cli.view import HostPort, server_of, with_view
 from catstream.client.address import Address
-from catstream.errors import SettingsError
 from catstream.jobs.job import Results
 from catstream.jobs.state import contains_run, files_of_state
 from catstream.pipeline import Pipeline
@@ -137,10 +136,6 @@ def track(
         raise click.UsageError(
             f"{option} and --overwrite are mutually exclusive (continue / replace the existing results)"
         )
-    try:
-        options = SinkOptions(rotate=parse_rotation(rotate) if rotate else None, keep=keep or 0)
-    except SettingsError as error:
-        raise click.UsageError(f"--rotate: {error}") from None
     if UNNAMED in saved and len(boxes) + len(models) > 1:
         raise click.UsageError("--save-model FILE is for a single object: pass NAME=FILE for each of several")
     console, notice = messages(), ""
@@ -161,9 +156,11 @@ def track(
             video=video,
             write=tuple(Path(place).absolute() for place in write if place != STDOUT) if write else None,
             models={name: file.absolute() for name, file in saved.items()},
+            rotate=rotate,
+            keep=keep,
         ),
     )
-    run = _Run(pipeline, resume or state, resume is not None, STDOUT in write, overwrite, view, options)
+    run = _Run(pipeline, resume or state, resume is not None, STDOUT in write, overwrite, view)
     run.check()
     doubts = _doubtful(boxes, *pipeline.size)
     objects = {*boxes, *models}
@@ -242,7 +239,6 @@ class _Run:
     stdout      whether tracks are also written to standard output
     overwrite   whether existing files are replaced
     view        address of the web page; None for none
-    options     when the logs are rotated
     """
 
     pipeline: Pipeline
@@ -251,15 +247,15 @@ class _Run:
     stdout: bool
     overwrite: bool
     view: HostPort | None
-    options: SinkOptions
 
     @property
     def files(self) -> RunFiles:
         """All files of tracks."""
-        pipeline = self.pipeline
-        places = [*places_of(pipeline.name, pipeline.results), *([STDOUT] if self.stdout else [])]
-        origin = Origin(pipeline.head, Address(keys=pipeline.settings.run.keys), self.options)
-        return RunFiles(origin, pipeline.results.output, places)
+        pipeline, results = self.pipeline, self.pipeline.results
+        places = [*places_of(pipeline.name, results), *([STDOUT] if self.stdout else [])]
+        options = SinkOptions(rotate=parse_rotation(results.rotate) if results.rotate else None, keep=results.keep or 0)
+        origin = Origin(pipeline.head, Address(keys=pipeline.settings.run.keys), options)
+        return RunFiles(origin, results.output, places)
 
     def check(self) -> None:
         """Raise VideoError or UsageError if a file of the run could not be written."""

@@ -41,12 +41,16 @@ class Results:
     video       whether an annotated video is among the results files
     write       further files of tracks, see `catstream.sinks.destinations`
     models      files for the model of each object, by name; a file without a name is for the only object
+    rotate      when the files of a live source are rotated, see `catstream.sinks.options.parse_rotation`
+    keep        number of rotated files that are kept of each
     """
 
     output: Path | None = None
     video: bool | None = None
     write: tuple[Path, ...] | None = None
     models: dict[str, Path] = field(default_factory=dict)
+    rotate: str | None = None
+    keep: int | None = None
 
     def after(self, earlier: Results) -> Results:
         """These files, and of a kind of which there is none the files of the earlier part of the run."""
@@ -55,6 +59,8 @@ class Results:
             video=earlier.video if self.video is None else self.video,
             write=earlier.write if self.write is None else self.write,
             models=self.models or earlier.models,
+            rotate=self.rotate or earlier.rotate,
+            keep=self.keep or earlier.keep,
         )
 
 

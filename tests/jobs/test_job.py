@@ -32,7 +32,10 @@ jobs = st.builds(
     settings=st.builds(lambda lag: Settings(run={"lag_frames": lag}), st.integers(0, 100)),
     size=st.none() | st.tuples(st.integers(1, 9000), st.integers(1, 9000)),
     results=st.builds(
-        Results, paths, st.booleans(), st.lists(st.text("ab/.", min_size=1).map(Path)).map(tuple), model_files
+        Results,
+        *(paths, st.booleans(), st.lists(st.text("ab/.", min_size=1).map(Path)).map(tuple), model_files),
+        rotate=st.none() | st.just("1d"),
+        keep=st.none() | st.integers(1, 99),
     ),
     state=paths,
     since=st.none() | st.floats(0, 1e9),
@@ -146,6 +149,9 @@ def test_a_resumed_run_writes_its_own_list_of_files_or_else_the_earlier_one():
     assert Results().after(earlier) == earlier
     assert Results(write=(Path("c.csv"),)).after(earlier).write == (Path("c.csv"),)
     assert Results(video=False, write=()).after(earlier) == Results(Path("out"), video=False, write=())
+    rotated = Results(rotate="1d", keep=30)
+    assert Results().after(rotated) == rotated
+    assert Results(keep=7).after(rotated) == Results(rotate="1d", keep=7)
 
 
 def test_a_state_folder_without_its_job_is_not_said_to_be_resumable(tmp_path):
