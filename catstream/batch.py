@@ -228,7 +228,6 @@ def track_video(video: Video, output: Path, settings: Settings) -> Summary:
         with one_thread(opencv=True), ExitStack() as stack:
             head, frames = _frames(video, settings, stack)
             files = _files(video, output, head, overwrite=True)
-            files.make_folder()
             output_files = stack.enter_context(files.opened(""))
             for frame in frames:
                 output_files.write(frame)

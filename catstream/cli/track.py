@@ -284,7 +284,6 @@ class _Run:
             # The files are closed after the processes, which would track on meanwhile, for none of them; the page is
             # served until it shows the end.
             with ExitStack() as closed_last, pipeline:
-                files.make_folder()
                 if notice:
                     console.print(notice)
                 if self.view is not None:
@@ -342,7 +341,7 @@ class _Run:
                 with INTERRUPTS.deferred():  # so that a frame is in all results or in none
                     outputs.write(TrackedFrame([*tracks.values()], moment - before))
                     progress.count(tracks)
-                    progress.not_written = outputs.missed
+                    progress.not_written = outputs.not_written
                     progress.show(status, console)
 
     def _say_what_holds(self, console: Console) -> None:

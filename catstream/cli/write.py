@@ -119,7 +119,7 @@ def sink(places: tuple[str, ...], values: dict[str, Any], address: Address, wait
         raise click.UsageError(str(error)) from None
     files = RunFiles(Origin(options=options), None, [*dict.fromkeys(places)])
     files.check(overwrite=True, earlier=[])
-    written, not_written, reason, run = 0, 0, "", ""
+    received, not_written, reason, run = 0, 0, "", ""
     newest: dict[str, int] = {}  # frame of the last track of each object
     address = address.with_endpoint()
     with subscribe(address, "tracks") as tracks:
@@ -139,11 +139,11 @@ def sink(places: tuple[str, ...], values: dict[str, Any], address: Address, wait
                     continue
                 with INTERRUPTS.deferred():  # a track is written everywhere or nowhere
                     outputs.write(TrackedFrame([track]))
-                    not_written, newest[track.object] = outputs.missed, track.frame
-                    written += not outputs.trouble
+                    not_written, newest[track.object] = outputs.not_written, track.frame
+                    received += 1
                 status.update(f"frame {track.frame}, {tracks.missed} missed")
         if tracks.end is not None:
             reason = f": {tracks.end.reason}"
         of = f" of {listed(newest)}" if any(newest) else ""
         lacking = f", {not_written} not written" if not_written else ""
-        click.echo(f"{counted(written, 'track')}{of}, {tracks.losses()}{lacking}{reason}", err=True)
+        click.echo(f"{counted(received - not_written, 'track')}{of}, {tracks.losses()}{lacking}{reason}", err=True)

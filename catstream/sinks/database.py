@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import sqlite3
 from collections import deque
@@ -12,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from catstream.base.box import Box
-from catstream.base.files import open_locked, writing
+from catstream.base.files import REMEDIES, open_locked, writing
 from catstream.base.text import counted
 from catstream.errors import VideoError
 from catstream.messages.kinds import Track
@@ -40,6 +41,9 @@ _MOST_WAITING = 1 << 16
 
 _CLOSE_SECONDS = 5.0  # wait for a locked database at the end
 
+#: Error of SQLite -> that of the system.
+_ERRNO = {sqlite3.SQLITE_FULL: errno.ENOSPC, sqlite3.SQLITE_READONLY: errno.EROFS, sqlite3.SQLITE_IOERR: errno.EIO}
+
 
 class _LockedError(VideoError):
     """Another program has locked the database."""
@@ -64,7 +68,11 @@ class SqliteSink:
                 Path(f"{place}{part}").unlink(missing_ok=True)
             self._lock.close()
             self._lock = open_locked(Path(place), VideoError)
-        self._flush()
+        try:
+            self._flush()
+        except VideoError:
+            self._lock.close()
+            raise
 
     def write(self, frame: TrackedFrame) -> None:
         """Add the rows of a frame, all or none, after those that wait."""
@@ -190,4 +198,5 @@ def _errors(place: str | Path, what: str = "write") -> Iterator[None]:
     except sqlite3.Error as error:
         if error.sqlite_errorcode & 0xFF in (sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED) and what == "write":
             raise _LockedError(f"{place} is locked by another program: close it there") from None
-        raise VideoError(f"cannot {what} {place}: {error}") from None
+        remedy = REMEDIES.get(_ERRNO.get(error.sqlite_errorcode & 0xFF, 0), "check the file")
+        raise VideoError(f"cannot {what} {str(place)!r} ({error}): {remedy}") from None

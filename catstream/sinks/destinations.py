@@ -143,6 +143,7 @@ class Origin:
     attached  whether another program runs the pipeline: its source is not read a second time
     last      last frame of the file if it is a log that is continued; None for a new file
     size      number of bytes up to the end of that frame
+    gap       frames that could not be written because the sink could not be opened
     """
 
     head: Head = field(default_factory=Head)
@@ -151,6 +152,7 @@ class Origin:
     attached: bool = False
     last: TrackedFrame | None = None
     size: int = 0
+    gap: int = 0
 
 
 class Sink(Protocol):
@@ -224,13 +226,16 @@ def is_file(place: str) -> bool:
 
 
 def check_result(path: Path, *, overwrite: bool, source: str = "", made: Path | None = None) -> None:
-    """Raise VideoError if a file is of the source, if another process writes it, or as `files.check_file` does."""
+    """Raise VideoError if a file is of the source, if another process writes it, or as `files.check_file` does.
+
+    The results of a live source may wait for a full disk.
+    """
     if source and path.exists() and Path(source).exists() and path.samefile(source):
         raise VideoError(f"{path} is the source, which would be lost: use another name or folder")
     if Path(source).is_dir() and path.exists() and path.suffix in VIDEOS | IMAGES and Path(source) in path.parents:
         raise VideoError(f"{path} is in the folder of the source, and may be its video: use another name or folder")
     check_unlocked(path, VideoError)
-    check_file(path, overwrite=overwrite, made=made, kind=VideoError)
+    check_file(path, overwrite=overwrite, made=made, kind=VideoError, may_wait=is_live(source))
 
 
 def check_sink(place: str, options: SinkOptions, source: str = "") -> None:

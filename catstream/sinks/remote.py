@@ -42,22 +42,22 @@ class Warnings:
 
     def __init__(self, place: str) -> None:
         self._address = redacted(place)
-        self._problems: set[str] = set()
+        self.problems: dict[str, None] = {}  #: since it has worked, in order
         self._working_since: float | None = None
 
     def failed(self, problem: str) -> None:
         """Log a problem of the destination; its text has no part that changes from one attempt to the next."""
         self._working_since = None
-        if problem not in self._problems:
-            self._problems.add(problem)
+        if problem not in self.problems:
+            self.problems[problem] = None
             self.log(problem)
 
     def working(self) -> None:
         """Note that the destination works; is called again and again while it does."""
         now = time.monotonic()
         since = self._working_since = self._working_since or now
-        if self._problems and now - since >= _STABLE_SECONDS:
-            self._problems.clear()
+        if self.problems and now - since >= _STABLE_SECONDS:
+            self.problems.clear()
             self.log("recovered")
 
     def log(self, text: str) -> None:

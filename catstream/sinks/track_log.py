@@ -16,7 +16,7 @@ import re
 import sys
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager, ExitStack, closing, suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
@@ -38,7 +38,6 @@ from catstream.sinks.database import read_database, read_database_head
 from catstream.sinks.destinations import (
     Head,
     Origin,
-    Rotation,
     Sink,
     TrackedFrame,
     check_result,
@@ -74,7 +73,7 @@ class LineSink(ABC):
     def __init__(self, place: str, origin: Origin) -> None:
         self.path, self._origin = Path(place), origin
         self._before = _FIRST if origin.last is None else _objects(origin.last)
-        self._gap = 0  # frames since the last one that was written
+        self._gap = origin.gap  # frames since the last one that was written
         self._is_rotated = False  # since the last one
         self._open(origin.size)
 
@@ -101,20 +100,21 @@ class LineSink(ABC):
         self._gap, self._is_rotated, self._before = 0, False, _objects(frame)
         self._status = os.fstat(self._file.fileno())
 
-    def must_rotate(self, rotation: Rotation, now: float) -> bool:
+    def must_rotate(self, now: float) -> bool:
         """Return whether the file is too large, or its last row is of an earlier period."""
+        if (rotation := self._origin.options.rotate) is None:
+            return False
         is_old = self._status.st_mtime // rotation.seconds < now // rotation.seconds
-        return not self._file.closed and (is_old or self._status.st_size > rotation.bytes)
+        return not self._is_rotated and (is_old or self._status.st_size > rotation.bytes)
 
     def rotate(self, now: float) -> None:
         """Rename the file, and remove the oldest renamed ones; the next frame begins a new file."""
         keep, target = self._origin.options.keep, _with_time(self.path, now)
-        if target.exists():  # from this second
+        if target.exists() or not self.path.exists():  # from this second; removed by another program
             return
         with writing(self.path, VideoError):
-            self._file.close()
-            self._is_rotated = True
             self.path.rename(target)
+            self._is_rotated = True
             name = re.compile(rf"{re.escape(self.path.stem)}-\d{{8}}T\d{{6}}{self.path.suffix}")
             renamed = sorted(file for file in self.path.parent.iterdir() if name.fullmatch(file.name))
             for file in renamed[:-keep] if keep else ():
@@ -413,7 +413,7 @@ class RunFiles:
     CSV file. The other files are made again from the log.
 
     origin  the source of the run, and the frames that are tracked
-    output  folder of the results, which is made; None for none
+    output  folder of the results, which is made if it does not exist; None for none
     places  the destinations, each once
     """
 
@@ -468,12 +468,6 @@ class RunFiles:
                 return False
         return bool(self.places)
 
-    def make_folder(self) -> None:
-        """Make the folder of the results, in which the run may also write other files."""
-        if self.output is not None:
-            with writing(self.output, VideoError):
-                self.output.mkdir(parents=True, exist_ok=True)
-
     def opened(self, endpoint: str, *, resume: bool = False, skip_damaged: bool = False) -> OpenFiles:
         """Open all destinations beside a pipeline; existing files are replaced.
 
@@ -483,20 +477,17 @@ class RunFiles:
         path = self._log() if resume else None  # before new ones exist
         log = None if path is None else Log(path, skip_damaged=skip_damaged)
         last, size = (None, 0) if log is None else log.last_whole_frame()
+        log_origin = replace(origin, last=last, size=size)
+        origins = {place: log_origin if Path(place) == path else origin for place in self.places}
         with ExitStack() as stack:
-            sinks: list[Sink] = []
-            followers: list[Sink] = []
-            for place in self.places:
-                continued = replace(origin, last=last, size=size) if Path(place) == path else origin
-                sinks.append(stack.enter_context(closing(open_sink(place, continued))))
-                if is_file(place) and Path(place) != path:
-                    followers.append(sinks[-1])
+            outputs = stack.enter_context(OpenFiles(origins, is_live=is_live(origin.head.source)))
             # The other files are made again from the log.
+            followers = [place for place in self.places if is_file(place) and Path(place) != path]
             for frame in log.frames() if log is not None and last is not None and followers else ():
-                for sink in followers:
-                    sink.write(frame)
-            continues = is_live(origin.head.source)
-            return OpenFiles(sinks, stack.pop_all(), continues=continues, rotation=origin.options.rotate)
+                for place in followers:
+                    outputs.write_to(place, frame)
+            stack.pop_all()
+        return outputs
 
     def continued(self, endpoint: str, *, resume: bool) -> OpenFiles:
         """The same for an unattended run: a file that is not continued is renamed, and folders are created.
@@ -520,60 +511,79 @@ class RunFiles:
 class OpenFiles(AbstractContextManager["OpenFiles"]):
     """All destinations of a run while it goes on. VideoError if one cannot be written any more, or completed.
 
-    If the run `continues`, as a live source does, a frame that cannot be written is counted, and the next one is tried.
+    If the source `is_live`, the run goes on instead: a frame that cannot be written is counted, and a destination that
+    could not be opened is tried again with each frame.
 
-    trouble  why the newest frame could not be written; empty if it was
+    not_written  frames that at least one destination lacks, as it could not be written
     """
 
-    def __init__(
-        self, sinks: Sequence[Sink], stack: ExitStack, *, continues: bool, rotation: Rotation | None = None
-    ) -> None:
-        self._sinks, self._stack, self._continues = sinks, stack, continues
-        self._rotation = rotation if continues else None
+    def __init__(self, origins: Mapping[str, Origin], *, is_live: bool) -> None:
+        self._origins, self._is_live, self.not_written = origins, is_live, 0
+        self._sinks: dict[str, Sink] = {}
         self._warnings = Warnings("results")
-        self._missed, self.trouble = 0, ""
+        with ExitStack() as self._stack:
+            for place in origins:
+                self.write_to(place)
+            self._stack = self._stack.pop_all()
 
     @property
     def missed(self) -> int:
         """Frames that could not be written everywhere, and messages that a destination on the network has missed."""
-        return self._missed + sum(getattr(sink, "missed", 0) for sink in self._sinks)
+        return self.not_written + sum(getattr(sink, "missed", 0) for sink in self._sinks.values())
+
+    @property
+    def trouble(self) -> str:
+        """Why frames could not be written; empty once all were written for some seconds."""
+        return "; ".join(self._warnings.problems)
 
     def write(self, frame: TrackedFrame) -> None:
         """Write a frame everywhere."""
-        if self._rotation is not None:
-            self._rotate(self._rotation)
-        problem = ""
-        for sink in self._sinks:
-            try:
-                sink.write(frame)
-            except VideoError as error:
-                if not self._continues:
-                    raise
-                problem = str(error)
-                self._warnings.failed(f"{problem}; tracking continues, and missing frames are counted")
-        self._missed += bool(problem)
-        self.trouble = problem
-        if not problem:
+        if self._is_live:
+            self._rotate()
+        written = [self.write_to(place, frame) for place in self._origins]
+        if all(written):
             self._warnings.working()
+        else:
+            self.not_written += 1
 
-    def _rotate(self, rotation: Rotation) -> None:
+    def write_to(self, place: str, frame: TrackedFrame | None = None) -> bool:
+        """Open a destination if it is not open, and write a frame to it; return whether that was possible."""
+        try:
+            if place not in self._sinks:
+                if is_file(place):
+                    with writing(place, VideoError):
+                        Path(place).parent.mkdir(parents=True, exist_ok=True)
+                sink = open_sink(place, replace(self._origins[place], gap=self.not_written))
+                self._sinks[place] = self._stack.enter_context(closing(sink))
+            if frame is not None:
+                self._sinks[place].write(frame)
+        except VideoError as error:
+            if not self._is_live:
+                raise
+            self._warnings.failed(f"{error}; tracking continues, and missing frames are counted")
+            return False
+        return True
+
+    def _rotate(self) -> None:
         """Rotate all logs at the same frame: a resumed run makes them again from the newest one."""
-        logs = [sink for sink in self._sinks if isinstance(sink, LineSink) and not isinstance(sink, StdoutSink)]
-        now = time.time()
-        if any(log.must_rotate(rotation, now) for log in logs):
+        sinks, now = self._sinks.values(), time.time()
+        logs = [sink for sink in sinks if isinstance(sink, LineSink) and not isinstance(sink, StdoutSink)]
+        if any(log.must_rotate(now) for log in logs):
             for log in logs:
-                with suppress(VideoError):  # a file that another program removed
+                try:
                     log.rotate(now)
+                except VideoError as error:
+                    self._warnings.failed(f"{error}; the log grows until it can be renamed")
 
     def idle(self) -> None:
         """Tell the destinations that no frame has arrived for a while."""
-        for sink in self._sinks:
+        for sink in self._sinks.values():
             if hasattr(sink, "idle"):
                 sink.idle()
 
     def end(self) -> None:
         """Tell the destinations that no frame follows, before one of them waits for its delivery."""
-        for sink in self._sinks:
+        for sink in self._sinks.values():
             if hasattr(sink, "end"):
                 sink.end()
 

@@ -2,7 +2,6 @@
 
 import signal
 import subprocess
-from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -48,13 +47,11 @@ def test_checkpoints_for_which_the_disk_has_no_room_are_said_and_the_run_goes_on
 
 
 @pytest.mark.parametrize("disk", [SMALL], indirect=True)
-def test_a_camera_is_tracked_while_the_disk_is_full_and_rows_are_written_again_after_it(catstream, disk, until):
-    log, ballast = disk / "out" / "demo-1.ndjson", disk / "ballast"
+def test_a_camera_is_tracked_while_the_disk_is_full_and_rows_are_written_again_after_it(catstream, disk, fill, until):
+    log = disk / "out" / "demo-1.ndjson"
     run = catstream("track", "demo:1", "--box", "184,88,57,58", "--output", disk / "out")
     until(lambda: log.exists() and log.read_bytes().count(b"\n") > 10)
-    with ballast.open("wb", buffering=0) as file, suppress(OSError):
-        while True:
-            file.write(bytes(4096))
+    ballast = fill()
     lines = iter(run.stderr.readline, "")
     assert any("No space left on device" in line for line in lines)
     ballast.unlink()

@@ -1,13 +1,15 @@
 """The log of a run: NDJSON and CSV hold every track at once, and are continued where a crash has cut them."""
 
 import csv
+import errno
 import json
 import os
 import subprocess
 import sys
 import tempfile
-from contextlib import ExitStack, closing, suppress
+from contextlib import ExitStack, closing
 from dataclasses import replace
+from functools import partial
 from itertools import count, product
 from math import inf
 from pathlib import Path
@@ -18,10 +20,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from catstream.base.box import Box
+from catstream.base.files import REMEDIES
 from catstream.errors import VideoError
 from catstream.jobs.job import Results
 from catstream.messages.kinds import Track
-from catstream.sinks import track_log
+from catstream.sinks import remote, track_log
 from catstream.sinks.destinations import Head, Origin, Rotation, SinkOptions, TrackedFrame, open_sink
 from catstream.sinks.track_log import JoinedLog, Log, RunFiles, places_of
 from catstream.video.rendered import write
@@ -88,25 +91,28 @@ def test_a_full_disk_is_reported_in_one_line_and_written_rows_are_kept(tmp_path,
 @pytest.mark.parametrize("disk", [1 << 20], indirect=True)
 @pytest.mark.parametrize("source", ["rtsp://cam", "walk.mp4"])
 @pytest.mark.parametrize("names", [["t.ndjson"], ["t.csv"], ["t.sqlite"], ["t.ndjson", "t.csv"]], ids=" ".join)
-def test_a_full_disk_costs_a_live_source_rows_until_there_is_room_and_ends_a_file(disk, names, source, caplog):
+def test_a_full_disk_costs_a_live_source_rows_until_there_is_room_and_ends_a_file(
+    disk, fill, names, source, caplog, monkeypatch
+):
     run = RunFiles(Origin(Head(source=source)), None, [str(disk / name) for name in names])
     frames = iter([TrackedFrame([track(number, "anna"), track(number, "ben")]) for number in range(10_000)])
     with run.opened("run") as outputs, ExitStack() as stack:
         for _ in range(20):
             outputs.write(next(frames))
-        with (disk / "ballast").open("wb", buffering=0) as ballast, suppress(OSError):
-            while True:
-                ballast.write(bytes(4096))
+        ballast = fill()
         if source == "walk.mp4":
             stack.enter_context(
                 pytest.raises(VideoError, match=r"cannot write .*(No space left on device|disk is full)")
             )
         while outputs.missed < 50:
             outputs.write(next(frames))
-        assert outputs.trouble
-        (disk / "ballast").unlink()
+        assert "tracking continues" in outputs.trouble
+        ballast.unlink()
         for _ in range(20):
             outputs.write(next(frames))
+        assert outputs.trouble, "it holds for some seconds"
+        monkeypatch.setattr(remote, "_STABLE_SECONDS", 0)
+        outputs.write(next(frames))
         assert not outputs.trouble
     for log in (Log(disk / name) for name in names):
         numbers = [frame.number for frame in log if len(frame.tracks) == 2]
@@ -117,6 +123,67 @@ def test_a_full_disk_costs_a_live_source_rows_until_there_is_room_and_ends_a_fil
         if source == "rtsp://cam":
             assert numbers[-20:] == [*range(numbers[-1] - 19, numbers[-1] + 1)]
             assert caplog.text.count(f"{log.path.name}' (No space") <= 1, "it is said once"
+
+
+@pytest.mark.parametrize("disk", [1 << 20], indirect=True)
+@pytest.mark.parametrize(("state", "remedy"), [("full", "free space on the disk"), ("read-only", "mount it writable")])
+@pytest.mark.parametrize("name", ["t.ndjson", "t.csv", "t.sqlite"])
+def test_a_live_run_begins_on_a_full_or_read_only_disk_and_is_written_once_that_is_possible(
+    disk, fill, remount, name, state, remedy, caplog
+):
+    log = Log(disk / "out" / name)
+    live, file = (
+        RunFiles(Origin(Head(source=source)), disk / "out", [str(log.path)]) for source in ("rtsp://cam", "walk.mp4")
+    )
+    ballast = fill() if state == "full" else remount("ro")
+    live.check(overwrite=False, earlier=[])
+    with pytest.raises(VideoError, match=remedy):
+        file.opened("run")
+    with live.opened("run") as outputs:
+        for number in range(12):
+            if number == 9 and state == "full":
+                ballast.unlink()
+            elif number == 9:
+                remount("rw")
+            outputs.write(TrackedFrame([track(number)]))
+    assert [frame.number for frame in log] == [9, 10, 11]
+    assert outputs.missed == 9
+    assert log.gap == (9 if name == "t.ndjson" else 0)
+    (message,) = caplog.messages
+    assert str(log.path) in message
+    assert remedy in message
+
+
+@pytest.mark.parametrize("code", [errno.EIO, errno.EDQUOT, errno.EROFS, errno.EACCES])
+def test_an_error_of_the_disk_is_said_once_with_path_reason_and_remedy_and_costs_the_rows_meanwhile(
+    tmp_path, code, monkeypatch, caplog
+):
+    def fail(*_):
+        raise OSError(code, os.strerror(code))
+
+    log = Log(tmp_path / "t.ndjson")
+    with RunFiles(Origin(Head(source="rtsp://cam")), None, [str(log.path)]).opened("run") as outputs:
+        for number in range(9):
+            with monkeypatch.context() as disk:
+                if 3 <= number < 6:
+                    disk.setattr(os, "write", fail)
+                outputs.write(TrackedFrame([track(number)]))
+    assert [frame.number for frame in log] == [0, 1, 2, 6, 7, 8]
+    assert log.gap == outputs.missed == 3
+    (message,) = caplog.messages
+    assert f"cannot write '{log.path}' ({os.strerror(code)}): {REMEDIES.get(code, 'use another folder')}" in message
+
+
+def test_a_log_that_cannot_be_renamed_grows_and_that_is_said_once(tmp_path, monkeypatch, caplog):
+    path = tmp_path / "t.ndjson"
+    origin = Origin(Head(source="rtsp://cam"), options=SinkOptions(rotate=Rotation(inf, 1000)))
+    with RunFiles(origin, None, [str(path)]).opened("run") as outputs, monkeypatch.context() as folder:
+        folder.setattr(Path, "rename", partial(os.rename, path.parent / "none"))
+        for number in range(50):
+            outputs.write(TrackedFrame([track(number)]))
+    assert [frame.number for frame in Log(path)] == [*range(50)]
+    (message,) = caplog.messages
+    assert message.endswith("use another folder; the log grows until it can be renamed")
 
 
 @pytest.mark.parametrize("source", ["rtsp://cam", "walk.mp4"])
@@ -154,11 +221,11 @@ def test_the_logs_of_a_live_source_rotate_together_and_are_read_as_one(tmp_path,
 
 
 def test_a_log_rotates_in_a_new_period_in_utc(tmp_path):
-    with closing(open_sink(str(tmp_path / "t.csv"), Origin())) as sink:
+    daily = SinkOptions(rotate=Rotation(86400, inf))
+    with closing(open_sink(str(tmp_path / "t.csv"), Origin(options=daily))) as sink:
         sink.write(TrackedFrame(TRACKS[:1]))
         midnight = (tmp_path / "t.csv").stat().st_mtime // 86400 * 86400 + 86400
-        daily = Rotation(86400, inf)
-        assert [sink.must_rotate(daily, now) for now in (midnight - 1, midnight)] == [False, True]
+        assert [sink.must_rotate(now) for now in (midnight - 1, midnight)] == [False, True]
 
 
 @pytest.mark.parametrize("disk", [4096], indirect=True)
@@ -178,7 +245,6 @@ def run_in(folder, *more):
 
 def add(run, history, first=0, resume=False):
     """Write the frames of a run from the first one on; a history has the names of the objects in each frame."""
-    run.make_folder()
     with run.opened("", resume=resume) as files:
         for number, names in enumerate(history):
             if number >= first:
