@@ -261,6 +261,23 @@ class Pipeline:
         self._rows += len(tracks or ())
         return tracks
 
+    def report_unwritten(self, frames: int, reason: str) -> None:
+        """Report that the program could not write the results of some frames, with the health of the detector.
+
+        Parameters
+        ----------
+        frames : int
+            Number of frames so far.
+        reason : str
+            Why they cannot be written; empty if they can be written again.
+
+        Raises
+        ------
+        ServiceError
+            If the pipeline was not started, or was closed.
+        """
+        self._running.report_unwritten(frames, reason)
+
     @property
     def _running(self) -> Supervisor:
         """The processes of the run, while it is open."""

@@ -64,6 +64,8 @@ class Status(msgspec.Struct):
             if "skipped" in counters:  # not of a file
                 reconnects = "reconnects" in counters and f", {counted(int(counters['reconnects']), 'reconnect')}"
                 yield "source", f"{counted(int(counters['skipped']), 'frame')} skipped{reconnects or ''}"
+            if not_written := counters.get("not_written"):
+                yield "results", f"{counted(int(not_written), 'frame')} not written"
         if "compressor" in self.processes and "bytes" in (trees := self.processes["compressor"].counters):
             size = f"{trees['bytes'] / 1e6:.1f} MB"  # there are none before the first box
             yield (

@@ -340,6 +340,7 @@ class _Run:
                 before, moment = moment, time.perf_counter()
                 with INTERRUPTS.deferred():  # so that a frame is in all results or in none
                     outputs.write(TrackedFrame([*tracks.values()], moment - before))
+                    pipeline.report_unwritten(outputs.not_written, outputs.trouble)
                     progress.count(tracks)
                     progress.not_written = outputs.not_written
                     progress.show(status, console)

@@ -175,6 +175,7 @@ class Stream:
                         closed_last.enter_context(outputs)
                         stack.callback(outputs.end)  # before the processes, and before the store
                     outputs.write(TrackedFrame([*tracks.values()]))
+                    pipeline.report_unwritten(outputs.not_written, outputs.trouble)
                 elif outputs is not None:
                     outputs.idle()
                 if self._stop.is_set():
@@ -237,9 +238,8 @@ class Stream:
                 )
 
     def _take(self, pipeline: Pipeline, tracks: dict[str, Track], outputs: OpenFiles | None) -> None:
-        """Take the tracks of a frame, none if none has arrived for a while, and the problems of the destinations."""
+        """Take the tracks of a frame, none if none has arrived for a while, and count what the destinations lack."""
         troubles = [f"{process}: {trouble}" for process, trouble in pipeline.trouble.items()]
-        troubles += [outputs.trouble] if outputs is not None and outputs.trouble else []
         if pipeline.lost_seconds:
             troubles.append(f"its source has been lost for {pipeline.lost_seconds:.0f} s")
         with self._lock:

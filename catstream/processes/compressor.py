@@ -147,7 +147,8 @@ class CompressorLoop:
             self._forest.check_features(message)
 
     def _counters(self) -> dict[str, float]:
-        return self._forest.counters() | {"stored": self._stored}
+        failed = float(bool(self._checkpoints.write_problem))
+        return self._forest.counters() | {"stored": self._stored, "write_failed": failed}
 
 
 class SavedModels(Publisher[ModelFile]):

@@ -57,7 +57,7 @@ class Process:
     trouble, source  description of a current problem, and the source; both are published with the health
     ending           why and how far the process has ended
     watchdog         counts the turns of the loop
-    owner            the frames that the owner of the run has; None if the process was started by hand
+    owner            the owner of the run; None if the process was started by hand
     """
 
     def __init__(self, name: str, job: Job, handle: int | None = None) -> None:
@@ -84,9 +84,14 @@ class Process:
         self.watchdog.beat()
         if now or time.monotonic() - self._reported >= HEALTH_SECONDS:
             self._reported = time.monotonic()
-            own = counters() | {"rejected": float(rejected())}
-            state = run_state(own)[0] if self.name == "detector" else None
-            self._health.send(Health(self.name, time.time(), own, self.trouble, self.source, objects(), state))
+            own, state, trouble = counters() | {"rejected": float(rejected())}, None, self.trouble
+            if self.name == "detector":
+                state = run_state(own)[0]
+                if self.owner is not None:
+                    of_results = self.owner.trouble.decode(errors="replace")
+                    own |= {"not_written": self.owner.not_written, "write_failed": float(bool(of_results))}
+                    trouble = "; ".join(filter(None, (trouble, of_results)))
+            self._health.send(Health(self.name, time.time(), own, trouble, self.source, objects(), state))
             release_memory()
         else:
             self._health.serve_late_joiners()

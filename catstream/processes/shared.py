@@ -36,16 +36,23 @@ class Watchdog(ctypes.Structure):
         self.turns += 1
 
 
-class OwnerPosition(ctypes.Structure):
-    """The frames that the owner of the run has: backpressure, as a detector is not too far ahead of it.
+class Owner(ctypes.Structure):
+    """The owner of the run: the frames that it has, as a detector is not too far ahead of it, and has not written.
 
-    after  number of the last message that it had when the process was started
-    read   number of the last message that it has read, infinite once it has received the end
+    after        number of the last message that it had when the process was started
+    read         number of the last message that it has read, infinite once it has received the end
+    not_written  frames that it could not write to its results
+    trouble      why it cannot write them, UTF-8; empty if it can
     """
 
-    _fields_ = (("after", ctypes.c_int64), ("read", ctypes.c_double))
+    _fields_ = (
+        *(("after", ctypes.c_int64), ("read", ctypes.c_double)),
+        *(("not_written", ctypes.c_int64), ("trouble", ctypes.c_char * 1000)),
+    )
     after: int
     read: float
+    not_written: int
+    trouble: bytes
 
 
 class SharedMemory:
@@ -53,11 +60,11 @@ class SharedMemory:
 
     def __init__(self, handle: int | None = None, after: int = 0) -> None:
         self.handle = os.memfd_create("catstream") if handle is None else handle
-        size = ctypes.sizeof(Watchdog) + ctypes.sizeof(OwnerPosition)
+        size = ctypes.sizeof(Watchdog) + ctypes.sizeof(Owner)
         os.truncate(self.handle, size)
         memory = mmap.mmap(self.handle, size)
         self.watchdog = Watchdog.from_buffer(memory)
-        self.owner = OwnerPosition.from_buffer(memory, ctypes.sizeof(Watchdog))
+        self.owner = Owner.from_buffer(memory, ctypes.sizeof(Watchdog))
         if handle is None:
             self.owner.after = self.owner.read = after
         self.watchdog.allow()

@@ -107,7 +107,9 @@ class Child:
         """Start the process; the owner of the run has the frames up to message `after`."""
         self.end()
         self.memory.close()
-        self.memory, self._turns, self.silent = SharedMemory(after=after), 0.0, 0.0
+        before, self.memory = self.memory.owner, SharedMemory(after=after)
+        self.memory.owner.not_written, self.memory.owner.trouble = before.not_written, before.trouble
+        self._turns = self.silent = 0.0
         self.hung = False
         self.log.begin()
         log, memory = self.log.fileno(), self.memory.handle
@@ -228,6 +230,11 @@ class Supervisor:
             raise VideoError(self.end.reason)
         return None
 
+    def report_unwritten(self, frames: int, reason: str) -> None:
+        """Report how many frames could not be written to the results, and why, with the health of the detector."""
+        owner = self._children["detector"].memory.owner
+        owner.not_written, owner.trouble = frames, reason.encode()[:1000]
+
     def stop(self) -> None:
         """End the processes in order, and receive what they still send; at once if this is interrupted."""
         self._ending.set()
@@ -293,7 +300,9 @@ class Supervisor:
         """Receive the health reports that have arrived, and log each new problem."""
         for report in self._reports.receive_all():
             before = self.health.get(report.process)
-            if report.trouble and (before is None or before.trouble != report.trouble):
+            is_new = before is None or before.trouble != report.trouble
+            is_logged = report.process == "detector" and report.counters.get("write_failed")  # by the owner
+            if report.trouble and is_new and not is_logged:
                 _log.warning("%s: %s", report.process, report.trouble)
             self.health = self.health | {report.process: report}
 

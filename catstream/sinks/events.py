@@ -1,4 +1,4 @@
-"""Events of objects, detected in their tracks, and of the source.
+"""Events of objects, detected in their tracks, and of the run, detected in its health reports.
 
 >>> from catstream.base.box import Box
 >>> events = Events({"door": ((50, 0), (90, 0), (90, 90), (50, 90))}, WHEN | {"lost": 1.0})
@@ -25,7 +25,7 @@ import numpy as np
 
 from catstream.base.names import check_name
 from catstream.errors import ObjectError, SettingsError
-from catstream.messages.kinds import Track
+from catstream.messages.kinds import Health, Track
 
 #: x and y, in pixels of the frame.
 Point = tuple[float, float]
@@ -40,6 +40,8 @@ KINDS = {
     "ended": "it was forgotten, another object got its name, or the tracks ended",
     "source_lost": "a live source has been lost for the seconds of `lost`",
     "source_back": "it is connected again after that",
+    "write_failed": "results of a live source, or checkpoints, cannot be written",
+    "write_resumed": "they can be written again",
 }
 
 #: All kinds; the value of "lost" is the seconds without a box after which an object is lost, and without a source.
@@ -55,26 +57,24 @@ _FORGOTTEN_FRAMES = 3
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """An event of an object or of the source.
+    """An event of an object or of the run.
 
-    kind     one of `KINDS`
-    track    of the object in the frame of the event; its last one if it ended; None if it is of the source
-    zone     name of the zone; empty if it is about none
-    source   of an event of the source: its name or address
-    seconds  the same: for how long it has been lost
+    kind   one of `KINDS`
+    track  of the object in the frame of the event; its last one if it ended; None if it is of the run
+    zone   name of the zone; empty if it is about none
+    facts  of an event of the run: its `source`; for how many `seconds` that was lost, or the number of `frames` that
+           are not written and the `reason`
     """
 
     kind: str
     track: Track | None
     zone: str = ""
-    source: str = ""
-    seconds: float = 0.0
+    facts: Mapping[str, Any] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, Any]:
         """The fields by name, of plain types for JSON, with the object and time of the track."""
         if self.track is None:
-            about = dict.fromkeys(("object", "time", "zone", "track"))
-            return {"event": self.kind, **about, "source": self.source, "seconds": round(self.seconds, 1)}
+            return {"event": self.kind, **dict.fromkeys(("object", "time", "zone", "track")), **self.facts}
         track = self.track.to_dict()
         about = {"event": self.kind, "object": track["object"], "time": track["time"], "zone": self.zone or None}
         return {**about, "track": track}
@@ -113,7 +113,8 @@ class Events:
         self._zones = {name: np.array(corners, np.float32) for name, corners in zones.items()}
         self._when, self._lost_seconds = when, when.get("lost", WHEN["lost"])
         self._objects: dict[str, _Object] = {}
-        self.source_lost, self._source_seconds = False, 0.0
+        self.source_lost, self._source, self._source_seconds = False, "", 0.0
+        self._write_problems: dict[str, str] = {}  # by process
         self._frame, self._frames = -1, 0  # number of the newest frame, and how many there were
 
     def update(self, tracks: Sequence[Track]) -> list[Event]:
@@ -128,11 +129,24 @@ class Events:
                 events += self._end(name)
         return self._selected(events)
 
-    def update_source(self, source: str, seconds: float) -> list[Event]:
-        """Return the event of a source that has been lost for some seconds, 0 if it is connected; at most one.
+    def update_run(self, report: Health) -> list[Event]:
+        """Return the events of the run in the next health report of one of its processes.
 
         The status of an object is unknown from `source_lost` to its next track.
         """
+        process, counters = report.process, report.counters
+        self._source = report.source or self._source
+        events = self._of_source(counters["lost_seconds"]) if "lost_seconds" in counters else []
+        before, problem = self._write_problems.get(process, ""), report.trouble if counters.get("write_failed") else ""
+        self._write_problems[process] = problem
+        if bool(before) != bool(problem):
+            facts = {"frames": int(counters.get("not_written", 0)), "reason": problem or before}
+            kind = "write_failed" if problem else "write_resumed"
+            events.append(Event(kind, None, facts={"source": self._source, **facts}))
+        return self._selected(events)
+
+    def _of_source(self, seconds: float) -> list[Event]:
+        """Return the event of a source that has been lost for some seconds, 0 if it is connected; at most one."""
         kind, lost_seconds = "", max(seconds, self._source_seconds)
         if seconds and seconds >= self._lost_seconds and not self.source_lost:
             kind, self.source_lost = "source_lost", True
@@ -141,7 +155,8 @@ class Events:
         elif not seconds and self.source_lost:
             kind, self.source_lost = "source_back", False
         self._source_seconds = seconds
-        return self._selected([Event(kind, None, source=source, seconds=lost_seconds)])
+        facts = {"source": self._source, "seconds": round(lost_seconds, 1)}
+        return [Event(kind, None, facts=facts)] * bool(kind)
 
     @property
     def tracks(self) -> list[Track]:

@@ -68,7 +68,7 @@ class EventStream:
     """Detects events, each with a picture if that is wanted: the first one of the frame of the event or a later one.
 
     If none arrives within `_PICTURE_SECONDS`, an event has the newest picture, None if there is none, as at once an
-    event of the source, which is detected in the health reports. Without pictures, events do not wait.
+    event of the run, which is detected in the health reports. Without pictures, events do not wait.
     """
 
     def __init__(self, origin: Origin, *, has_pictures: bool) -> None:
@@ -94,8 +94,7 @@ class EventStream:
             self._next_look = now + _REPORT_SECONDS
             with suppress(SilenceError):  # no further report has arrived
                 for report in self._reports or ():
-                    if (lost := report.counters.get("lost_seconds")) is not None:
-                        events += self.events.update_source(report.source, lost)
+                    events += self.events.update_run(report)
         self._waiting += [(event, now + _PICTURE_SECONDS) for event in events]
         with suppress(SilenceError):  # no further picture has arrived
             for preview in self._previews or ():

@@ -28,7 +28,7 @@ Sample = tuple[str, float, dict[str, str]]
 
 #: Counters of the processes, streams and nodes that only count up.
 _COUNT_UP = {"sent", "processed", "stored", "skipped", "reconnects", "damaged", "scaled", "rejected", "frames", "rows"}
-_COUNT_UP |= {"leaves", "trained", "missed", *(f"{tree}_leaves" for tree in TREES)}
+_COUNT_UP |= {"not_written", "leaves", "trained", "missed", *(f"{tree}_leaves" for tree in TREES)}
 
 #: Counters of the detector without a metric: they are constant, or in `state`, `paused` and `source_lost_seconds`.
 _OMITTED = {"paused", "waiting", "ended", "lost_seconds", "zero_time", "width", "height", "start", "stride"}
@@ -45,6 +45,8 @@ _HELP = {
     "sent": "Tracked frames, whose features were sent to the compressor.",
     "processed": "Tracked frames whose features the compressor has received.",
     "stored": "Tracked frames whose features are in the coreset trees.",
+    "not_written": "Frames that are missing in the results, because they could not be written.",
+    "write_failed": "1 while results (detector) or checkpoints (compressor) cannot be written.",
     "skipped": "Frames of a live source that were not tracked, because a newer one had arrived.",
     "reconnects": "Reconnections to a live source.",
     "damaged": "Frames of a file that could not be decoded.",

@@ -1,5 +1,6 @@
 """A disk that is full before the run has ended: what is lost is said on the terminal, and what was written is kept."""
 
+import json
 import signal
 import subprocess
 from pathlib import Path
@@ -47,13 +48,24 @@ def test_checkpoints_for_which_the_disk_has_no_room_are_said_and_the_run_goes_on
 
 
 @pytest.mark.parametrize("disk", [SMALL], indirect=True)
-def test_a_camera_is_tracked_while_the_disk_is_full_and_rows_are_written_again_after_it(catstream, disk, fill, until):
+def test_a_camera_is_tracked_while_the_disk_is_full_and_rows_are_written_again_after_it(
+    catstream, succeed, disk, fill, until, tmp_path
+):
     log = disk / "out" / "demo-1.ndjson"
-    run = catstream("track", "demo:1", "--box", "184,88,57,58", "--output", disk / "out")
+    place = ["--endpoint", str(tmp_path / "run")]
+    catstream("sink", f"{tmp_path}/events/", *place)
+    run = catstream(
+        "track", "demo:1", "--box", "184,88,57,58", "--output", disk / "out", "--set", f"run.endpoint={place[1]}"
+    )
     until(lambda: log.exists() and log.read_bytes().count(b"\n") > 10)
     ballast = fill()
     lines = iter(run.stderr.readline, "")
     assert any("No space left on device" in line for line in lines)
+    said = until(lambda: [line for line in succeed("status", *place)[0].splitlines() if "writ" in line] or None)
+    assert [line.split()[0] for line in said] == ["results", "trouble"]
+    (event,) = until(lambda: [*map(json.loads, (tmp_path / "events" / "events.ndjson").read_text().splitlines())][1:])
+    assert (event["event"], event["source"]) == ("write_failed", "demo:1")
+    assert f"cannot write '{log}' (No space left on device)" in event["reason"]
     ballast.unlink()
     until(lambda: b'"gap":' in log.read_bytes().partition(b"\n")[2])
     run.send_signal(signal.SIGINT)

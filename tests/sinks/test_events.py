@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from catstream.base.box import Box
 from catstream.errors import SettingsError
-from catstream.messages.kinds import Track
+from catstream.messages.kinds import Health, Track
 from catstream.sinks.events import WHEN, Events, check_zones
 
 #: A square of x and y from 40 to 60.
@@ -69,13 +69,32 @@ def test_only_the_events_that_are_wanted_are_told():
 def test_a_source_is_lost_after_the_seconds_of_lost_and_objects_are_unknown_until_their_next_track():
     events = Events(DOOR, WHEN | {"lost": 3.0})
     events.update([*tracks("5")])
-    reports = [events.update_source("cam", seconds) for seconds in (0.0, 1.0, 3.0, 9.0, 0.0, 2.0, 0.0)]
-    assert [[(event.kind, event.seconds) for event in each] for each in reports] == [
+    seconds = (0.0, 1.0, 3.0, 9.0, 0.0, 2.0, 0.0)
+    reports = [events.update_run(Health("detector", 0.0, {"lost_seconds": each})) for each in seconds]
+    assert [[(event.kind, event.facts["seconds"]) for event in each] for each in reports] == [
         [], [], [("source_lost", 3.0)], [], [("source_back", 9.0)], [], [],
     ]  # fmt: skip
     assert events.status("") == {"present": None, "zones": []}
     assert told(events.update([*tracks("5", first=1)])) == []
     assert events.status("") == {"present": True, "zones": ["door"]}
+
+
+def test_results_and_checkpoints_that_cannot_be_written_are_an_event_each_and_so_is_their_end():
+    events = Events({})
+    reports = [
+        *(
+            Health("detector", 0, {"write_failed": failed, "not_written": 7.0}, "full", "cam")
+            for failed in (0, 1, 1, 0)
+        ),
+        *(Health("compressor", 0, {"write_failed": failed}, "read-only" * failed) for failed in (0, 1, 0, 0)),
+    ]
+    found = [event for report in reports for event in events.update_run(report)]
+    assert [(event.kind, *event.facts.values()) for event in found] == [
+        ("write_failed", "cam", 7, "full"),
+        ("write_resumed", "cam", 7, "full"),
+        ("write_failed", "cam", 0, "read-only"),
+        ("write_resumed", "cam", 0, "read-only"),
+    ]
 
 
 def test_another_object_of_the_same_name_ends_the_one_before():
