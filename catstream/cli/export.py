@@ -18,7 +18,7 @@ from catstream.sinks import exports
 from catstream.sinks.annotations import About, classes_of
 from catstream.sinks.destinations import Head
 from catstream.sinks.exports import EXPORTS
-from catstream.sinks.track_log import JoinedLog, Log, logs_of
+from catstream.sinks.track_log import JoinedLog, logs_of
 from catstream.video.source import VIDEOS, open_source
 
 
@@ -91,10 +91,7 @@ def export(
         raise click.UsageError("--classes requires a format with classes: coco, cvat or yolo")
     if images and form is not EXPORTS["yolo"]:
         raise click.UsageError("--images requires --format yolo")
-    logs: list[Log] = [Log(path, skip_damaged=skip_damaged) for file in files for path in logs_of(file)]
-    for content in logs:
-        if next(content.frames(), None) is None:
-            raise VideoError(f"{content.path} contains no tracks")
+    logs = logs_of(files, skip_damaged=skip_damaged)
     if form.suffix and len(logs) > 1:
         logs = [JoinedLog(logs)]
     if not form.suffix:

@@ -67,7 +67,7 @@ class _Object:
     frames   int (n,), their numbers in the source
     times    float64 (n,), seconds
     ends     float64 (n,), seconds: the time of the next frame; before a gap, after one interval
-    gaps     bool (n - 1,), whether the source was lost between a frame and the next one
+    gaps     bool (n - 1,), whether the source was lost, or frames are missing, between a frame and the next one
     steps    float64 (n - 1,), distance from each centre of the box to the next one; NaN next to an absence or a gap
     states   present, doubtful or absent, (n,)
     """
@@ -77,7 +77,8 @@ class _Object:
         self.times: Float64 = np.array([track.time for track in tracks])
         intervals = np.diff(self.times)
         self.interval = float(np.median(intervals) if len(intervals) else 0) or 1 / rate
-        self.gaps = intervals > max(_GAP_SECONDS, 5 * self.interval)
+        are_missing = np.diff([track.frame for track in tracks]) > 1
+        self.gaps = (intervals > max(_GAP_SECONDS, 5 * self.interval)) | are_missing
         self.ends = self.times + np.append(np.where(self.gaps, self.interval, intervals), self.interval)
         boxes = np.array([track.box or [np.nan] * 4 for track in tracks], np.float64)
         self.steps: Float64 = scale.size * np.hypot(*np.diff(boxes[:, :2] + boxes[:, 2:] / 2, axis=0).T)
@@ -127,20 +128,14 @@ class _Object:
 
 
 class Section:
-    """The part of the report about a video; its attributes are the values of the template.
+    """The part of the report about a video, from a log with tracks; its attributes are the values of the template."""
 
-    Raises VideoError if the log cannot be read, or contains no track.
-    """
-
-    def __init__(self, path: Path, *, skip_damaged: bool, scale: Scale) -> None:
-        self._log = Log(path, skip_damaged=skip_damaged)
-        self.name, self._head, self.unit = path.stem, self._log.head() or Head(), scale.unit
+    def __init__(self, log: Log, scale: Scale) -> None:
+        self._log, self.name, self._head, self.unit = log, log.path.stem, log.head() or Head(), scale.unit
         tracks: dict[tuple[str, int], list[Track]] = {}
         for frame in self._log:
             for track in frame.tracks:
                 tracks.setdefault((track.object, track.began), []).append(track)
-        if not tracks:
-            raise VideoError(f"{path} contains no track: pass the log of a run")
         self.gap = self._log.gap
         self._labels, self._scale = dict[tuple[str, int], str](), scale
         for (name, began), rows in tracks.items():  # another object that reuses a name has a label of its own

@@ -61,6 +61,8 @@ _COLUMNS = (
 )
 _OPTIONAL = {"source_frame", "checked", "probability", "processing"}
 
+_TIME = r"-\d{8}T\d{6}"  # in the name of a rotated file
+
 
 class LineSink(ABC):
     """A file with a line for each track. Written lines remain if this process crashes.
@@ -115,7 +117,7 @@ class LineSink(ABC):
         with writing(self.path, VideoError):
             self.path.rename(target)
             self._is_rotated = True
-            name = re.compile(rf"{re.escape(self.path.stem)}-\d{{8}}T\d{{6}}{self.path.suffix}")
+            name = re.compile(rf"{re.escape(self.path.stem)}{_TIME}{self.path.suffix}")
             renamed = sorted(file for file in self.path.parent.iterdir() if name.fullmatch(file.name))
             for file in renamed[:-keep] if keep else ():
                 file.unlink()
@@ -230,18 +232,6 @@ def is_log(path: Path) -> bool:
     return path.suffix in LOGS
 
 
-def logs_of(path: Path) -> list[Path]:
-    """Return a log, or the NDJSON logs in a folder; VideoError if there is none."""
-    if path.is_dir():
-        if not (logs := sorted(path.glob("*.ndjson"))):
-            raise VideoError(f"{path} contains no .ndjson file: pass the output folder of a run or a batch")
-        return logs
-    if not is_log(path) or not path.is_file():
-        problem = "is not the log of a run" if path.exists() else "does not exist"
-        raise VideoError(f"{path} {problem}: pass one of a run's files, {', '.join(LOGS)}")
-    return [path]
-
-
 class Log:
     """A log, from which the tracks of a run are read. It may grow meanwhile.
 
@@ -354,6 +344,32 @@ class Log:
 def _with_time(path: Path, seconds: float) -> Path:
     """Return the name of a file that is renamed: the names sort by the time, in UTC, and before the newest one."""
     return path.with_stem(f"{path.stem}-{datetime.fromtimestamp(seconds, UTC):%Y%m%dT%H%M%S}")
+
+
+def logs_of(files: Iterable[Path], *, skip_damaged: bool = False) -> list[Log]:
+    """Return logs, and the NDJSON logs of folders; VideoError if one is no log, or contains no tracks."""
+    paths: list[Path] = []
+    for path in files:
+        found = sorted(path.glob("*.ndjson")) if path.is_dir() else [path]
+        if not found:
+            raise VideoError(f"{path} contains no .ndjson file: pass the output folder of a run or a batch")
+        if not is_log(found[0]) or not found[0].is_file():
+            problem = "is not the log of a run" if path.exists() else "does not exist"
+            raise VideoError(f"{path} {problem}: pass one of a run's files, {', '.join(LOGS)}")
+        paths += found
+    logs = [Log(path, skip_damaged=skip_damaged) for path in paths]
+    for log in logs:
+        if next(log.frames(), None) is None:
+            raise VideoError(f"{log.path} contains no tracks")
+    return logs
+
+
+def join_rotated(logs: Iterable[Log]) -> list[Log]:
+    """Join the rotated files of each run, whose names differ in the time."""
+    runs: dict[str, list[Log]] = {}
+    for log in sorted(logs, key=lambda log: log.path.name):
+        runs.setdefault(re.sub(_TIME, "", log.path.name), []).append(log)
+    return [JoinedLog(run) if len(run) > 1 else run[0] for run in runs.values()]
 
 
 class JoinedLog(Log):

@@ -97,6 +97,22 @@ def test_the_logs_of_a_folder_have_a_section_each_and_names_are_escaped(succeed,
     assert len(re.findall("<polyline", page)) == 3 * 2
 
 
+def test_rotated_logs_are_one_section_in_which_frames_that_are_not_written_are_a_gap(succeed, tmp_path):
+    whole = write_log(tmp_path / "gate.ndjson", states="PPPPPPPPPP").read_text().splitlines(keepends=True)
+    (tmp_path / "gate-20261128T000000.ndjson").write_text("".join(whole[:5]))
+    (tmp_path / "gate.ndjson").write_text("".join([whole[0], Head(gap=3).to_json() + "\n", *whole[8:]]))
+    write_log(tmp_path / "gate-2.ndjson")
+    _, errors = succeed("report", tmp_path, tmp_path / "page.html")
+    assert "gate: the log lacks 3 frames" in errors
+    page = (tmp_path / "page.html").read_text()
+    assert re.findall(r"<h2>(.*?) <small>", page) == ["gate-2", "gate"]
+    assert re.findall(r'"(present, .*?)" style="left:(.*?)%;width:(.*?)%">', page)[-2:] == [
+        ("present, 0:00.0 to 0:00.4, frames 0 to 3", "0.00", "40.00"),
+        ("present, 0:00.7 to 0:01.0, frames 7 to 9", "70.00", "30.00"),
+    ]
+    assert [row[6:9] for row in cells(page) if row][-1] == ["0.7 s", "25 px", "50 px/s"]
+
+
 @pytest.mark.parametrize(
     ("name", "words"), [("none.ndjson", "pass"), ("walk.txt", "pass"), ("empty", "pass"), ("a.ndjson", "no track")]
 )
