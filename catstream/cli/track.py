@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
 from itertools import combinations
@@ -49,6 +49,10 @@ from catstream.sinks.options import parse_rotation
 from catstream.sinks.track_log import OpenFiles, RunFiles, places_of
 
 _SAME = 0.95  # overlap of boxes that were meant to be one
+_COMPLETE = (
+    "no frames remained to track, the run in {} is complete: to track the source again, start a new run in another "
+    "folder (--state DIR)"
+)
 
 
 def _files_only(_: click.Context, __: click.Parameter, places: tuple[str, ...]) -> tuple[str, ...]:
@@ -169,65 +173,7 @@ def track(
         doubts.append(f"there is no object {names} yet: its model is saved if one begins under this name")
     for line in doubts:
         console.print(line)
-    outcome = run.execute(console, notice)
-    for line in outcome.lines():
-        console.print(line)
-    if outcome.interrupted:
-        stopped(outcome.rest())
-
-
-@dataclass(frozen=True, slots=True)
-class Outcome:
-    """How a run has ended.
-
-    interrupted  whether Ctrl-C or a signal ended it
-    frames       number of frames that were tracked
-    missing      results that another program removed
-    saved        files of models that were written
-    unsaved      files of models that were not
-    folder       folder of the state; None for none
-    is_resumed   whether the run began as an earlier one in this folder
-    has_run      whether the folder still contains the run
-    """
-
-    interrupted: bool
-    frames: int
-    missing: list[str]
-    saved: list[Path]
-    unsaved: list[Path]
-    folder: Path | None
-    is_resumed: bool
-    has_run: bool
-
-    def lines(self) -> Iterator[str]:
-        """Yield the last lines, after the summary of the tracks."""
-        if self.missing:
-            yield f"missing results, which another program removed: {', '.join(self.missing)}"
-        if not self.frames and not self.is_resumed:
-            yield "no frame was tracked"
-        elif not self.frames and not self.interrupted:
-            yield (
-                f"no frames remained to track, the run in {self.folder} is complete: to track the source again, "
-                "start a new run in another folder (--state DIR)"
-            )
-        for file in self.saved:
-            yield f"saved model: {file}"
-
-    def rest(self) -> str:
-        """Say what an interrupted run has left, and how to continue it.
-
-        >>> Outcome(True, 9, [], [], [Path("m")], Path("state"), False, True).rest()
-        'the results so far are kept; not saved: m; to continue: catstream track --resume state'
-        """
-        kept = ["the results so far are kept"] if self.frames or self.is_resumed else []
-        parts = ["some results are missing"] if self.missing else kept
-        if self.unsaved:
-            parts.append(f"not saved: {', '.join(map(str, self.unsaved))}")
-        if self.folder is not None and self.has_run:
-            parts.append(f"to continue: catstream track --resume {quote(str(self.folder))}")
-        elif self.folder is not None:
-            parts.append(f"the state in {self.folder} was removed, so the run cannot be resumed")
-        return "; ".join(parts)
+    run.execute(console, notice)
 
 
 @dataclass(frozen=True, slots=True)
@@ -270,13 +216,14 @@ class _Run:
         for file in set(results.models.values()) - set(pipeline.earlier_results.models.values()):
             check_result(file, overwrite=self.overwrite, source=pipeline.source, made=results.output)
 
-    def execute(self, console: Console, notice: str) -> Outcome:
-        """Run to the end, and print a summary, also of a run that an error ends."""
+    def execute(self, console: Console, notice: str) -> None:
+        """Run to the end, and print a summary, also of a run that an error ends, and how to continue."""
         pipeline, files = self.pipeline, self.files
         if self.is_resumed:
             has_models = all(file.exists() for file in pipeline.results.models.values())
             if has_models and files.is_complete(pipeline.frames):
-                return Outcome(False, 0, [], [], [], self.folder, is_resumed=True, has_run=True)
+                console.print(_COMPLETE.format(self.folder))
+                return
             skip_damaged = pipeline.settings.run.skip_damaged
             pipeline.first_frame, pipeline.first_time = files.position(skip_damaged=skip_damaged)
         progress, interrupted = RunProgress(pipeline), False
@@ -295,12 +242,25 @@ class _Run:
             if progress.frames and not isinstance(sys.exception(), BrokenPipeError):
                 results = [*filter(None, [pipeline.results.output]), *(pipeline.results.write or ())]
                 console.print(progress.summary([str(path) for path in results if path.exists()]))
-        saved = pipeline.saved_models
-        unsaved = [file for file in pipeline.results.models.values() if file not in saved]
-        has_run = self.folder is not None and contains_run(self.folder)
         missing = files.missing() if progress.frames else []
-        ended = (interrupted, progress.frames, missing, saved, unsaved)
-        return Outcome(*ended, self.folder, self.is_resumed, has_run)
+        if missing:
+            console.print(f"missing results, removed or never written: {', '.join(missing)}")
+        if not progress.frames and not self.is_resumed:
+            console.print("no frame was tracked")
+        elif not progress.frames and not interrupted:
+            console.print(_COMPLETE.format(self.folder))
+        for file in pipeline.saved_models:
+            console.print(f"saved model: {file}")
+        if interrupted:
+            kept = ["the results so far are kept"] if progress.frames or self.is_resumed else []
+            parts = ["some results are missing"] if missing else kept
+            if unsaved := [str(file) for file in pipeline.results.models.values() if file not in pipeline.saved_models]:
+                parts.append(f"not saved: {', '.join(unsaved)}")
+            if self.folder is not None and contains_run(self.folder):
+                parts.append(f"to continue: catstream track --resume {quote(str(self.folder))}")
+            elif self.folder is not None:
+                parts.append(f"the state in {self.folder} was removed, so the run cannot be resumed")
+            stopped("; ".join(parts))
 
     def _serve(self, view: HostPort, stack: ExitStack, console: Console) -> None:
         """Serve the web page of the pipeline until the stack is left."""
