@@ -262,19 +262,9 @@ class Pipeline:
         return tracks
 
     def report_unwritten(self, frames: int, reason: str) -> None:
-        """Report that the program could not write the results of some frames, with the health of the detector.
+        """Report how many frames the program could not write so far, and why: "" once they are written again.
 
-        Parameters
-        ----------
-        frames : int
-            Number of frames so far.
-        reason : str
-            Why they cannot be written; empty if they can be written again.
-
-        Raises
-        ------
-        ServiceError
-            If the pipeline was not started, or was closed.
+        `catstream status`, the health reports, the metrics and events include it.
         """
         self._running.report_unwritten(frames, reason)
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import errno
 import logging
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import TypeVar
 
@@ -87,8 +88,14 @@ class CheckpointStore:
             forest.save(path, durable=durable)
             self.size = path.stat().st_size
         except OSError as error:
-            if error.errno in (errno.ENOSPC, errno.EDQUOT) and self._remove_oldest(files):
-                return self.save(forest, durable=durable)
+            by_value = sorted(files, key=lambda file: file not in self._damaged)  # damaged ones first, then by age
+            if error.errno in (errno.ENOSPC, errno.EDQUOT) and len(by_value) > 1:
+                with suppress(OSError):
+                    sync(by_value[-1])  # else a power cut might leave none
+                    by_value[0].unlink()
+                    self._durable = by_value[-1]
+                    self._damaged = [file for file in self._damaged if file != by_value[0]]
+                    return self.save(forest, durable=durable)
             remedy = REMEDIES.get(error.errno or 0, "make the folder writable")
             problem = f"cannot write checkpoints to {self._folder} ({error.strerror}): {remedy}"
             if problem != self.write_problem:
@@ -105,22 +112,6 @@ class CheckpointStore:
         for old in self._files()[:-_CHECKPOINTS]:
             if old != self._durable:
                 old.unlink()
-        return True
-
-    def _remove_oldest(self, files: Sequence[Path]) -> bool:
-        """Remove a damaged checkpoint, or the oldest; return False if only the newest valid one is left."""
-        valid = [path for path in files if path not in self._damaged]
-        removable = [*self._folder.glob(_DAMAGED), *self._damaged, *valid[:-1]]
-        if not removable:
-            return False
-        try:
-            for newest in valid[-1:]:
-                sync(newest)
-                self._durable = newest
-            removable[0].unlink()
-        except OSError:
-            return False
-        self._damaged = [path for path in self._damaged if path != removable[0]]
         return True
 
     def _files(self) -> list[Path]:

@@ -10,6 +10,7 @@ import errno
 import json
 import os
 import re
+import shutil
 import tempfile
 import zlib
 from pathlib import Path
@@ -31,6 +32,7 @@ Metadata = dict[str, Any]
 Message = TypeVar("Message")
 
 _KEY = "catstream"  # the only metadata key: with several, their order, and so the bytes of the file, would vary
+_ROOM = 1.1  # free space that is required for a file, in sizes of its arrays
 _VERSION = 1  # version of the metadata's format
 
 
@@ -38,10 +40,13 @@ def write(path: str | os.PathLike[str], arrays: Arrays, metadata: Metadata, *, d
     """Write arrays and JSON metadata to a file for its owner only, as `write_atomically` does; memory holds no copy.
 
     A file that is not durable survives the death of this process, and may be lost or damaged by a power cut.
-    OSError if the file cannot be written; the old one stays unchanged.
+    OSError if the file cannot be written; the old one stays unchanged. Without room for it, nothing is written, as the
+    attempt would take the last bytes of the disk from the log of a run.
     """
     path = Path(path)
     remove_parts(path)
+    if shutil.disk_usage(path.parent).free < _ROOM * sum(array.nbytes for array in arrays.values()):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
     # In a folder of its own, because safetensors makes a file beside the one that it writes.
     with tempfile.TemporaryDirectory(".part", f".{path.name}.", path.parent, ignore_cleanup_errors=True) as folder:
         part, (contiguous, header) = Path(folder, path.name), _content(arrays, metadata)

@@ -226,10 +226,7 @@ def is_file(place: str) -> bool:
 
 
 def check_result(path: Path, *, overwrite: bool, source: str = "", made: Path | None = None) -> None:
-    """Raise VideoError if a file is of the source, if another process writes it, or as `files.check_file` does.
-
-    The results of a live source may wait for a full disk.
-    """
+    """Raise VideoError if a file is of the source, if another process writes it, or as `files.check_file` does."""
     if source and path.exists() and Path(source).exists() and path.samefile(source):
         raise VideoError(f"{path} is the source, which would be lost: use another name or folder")
     if Path(source).is_dir() and path.exists() and path.suffix in VIDEOS | IMAGES and Path(source) in path.parents:

@@ -134,29 +134,24 @@ class Events:
 
         The status of an object is unknown from `source_lost` to its next track.
         """
-        process, counters = report.process, report.counters
+        process, counters, events = report.process, report.counters, dict[str, dict[str, Any]]()
         self._source = report.source or self._source
-        events = self._of_source(counters["lost_seconds"]) if "lost_seconds" in counters else []
+        if (seconds := counters.get("lost_seconds")) is not None:
+            if seconds and seconds >= self._lost_seconds and not self.source_lost:
+                self.source_lost = True
+                events["source_lost"] = {"seconds": round(seconds, 1)}
+                for item in self._objects.values():
+                    item.is_known = False
+            elif not seconds and self.source_lost:
+                self.source_lost = False
+                events["source_back"] = {"seconds": round(self._source_seconds, 1)}
+            self._source_seconds = seconds
         before, problem = self._write_problems.get(process, ""), report.trouble if counters.get("write_failed") else ""
         self._write_problems[process] = problem
         if bool(before) != bool(problem):
             facts = {"frames": int(counters.get("not_written", 0)), "reason": problem or before}
-            kind = "write_failed" if problem else "write_resumed"
-            events.append(Event(kind, None, facts={"source": self._source, **facts}))
-        return self._selected(events)
-
-    def _of_source(self, seconds: float) -> list[Event]:
-        """Return the event of a source that has been lost for some seconds, 0 if it is connected; at most one."""
-        kind, lost_seconds = "", max(seconds, self._source_seconds)
-        if seconds and seconds >= self._lost_seconds and not self.source_lost:
-            kind, self.source_lost = "source_lost", True
-            for item in self._objects.values():
-                item.is_known = False
-        elif not seconds and self.source_lost:
-            kind, self.source_lost = "source_back", False
-        self._source_seconds = seconds
-        facts = {"source": self._source, "seconds": round(lost_seconds, 1)}
-        return [Event(kind, None, facts=facts)] * bool(kind)
+            events["write_failed" if problem else "write_resumed"] = facts
+        return self._selected([Event(kind, None, facts={"source": self._source, **events[kind]}) for kind in events])
 
     @property
     def tracks(self) -> list[Track]:

@@ -94,10 +94,14 @@ class LineSink(ABC):
         try:
             self._follow()
             with writing(self.path, VideoError):
-                self._write([*self.gap_lines(self._gap), *lines] if self._gap else lines)
+                if self._gap:
+                    self._remove_part()
+                    lines = [*self.gap_lines(self._gap), *lines]
+                self._write(lines)
         except VideoError:
             self._gap += 1
-            self._remove_part()
+            with suppress(OSError, ValueError):  # it may be closed
+                self._remove_part()
             raise
         self._gap, self._is_rotated, self._before = 0, False, _objects(frame)
         self._status = os.fstat(self._file.fileno())
@@ -139,8 +143,7 @@ class LineSink(ABC):
 
     def _remove_part(self) -> None:
         """Remove the part of a frame that was written before an error."""
-        with suppress(OSError, ValueError):  # it may be closed
-            os.ftruncate(self._file.fileno(), self._status.st_size)
+        os.ftruncate(self._file.fileno(), self._status.st_size)
 
     def _open(self, size: int) -> None:
         self._file: IO[bytes] = open_locked(self.path, VideoError, size, mode="ab", buffering=0)
@@ -155,7 +158,7 @@ class LineSink(ABC):
     def _follow(self) -> None:
         """Open a new file if another program has removed, renamed or truncated the file."""
         rest, problem = 0, "removed or renamed"
-        with suppress(OSError):
+        with writing(self.path, VideoError), suppress(FileNotFoundError, NotADirectoryError):
             status = self.path.stat()
             if os.path.samestat(status, self._status):
                 if status.st_size >= self._status.st_size:
@@ -261,10 +264,9 @@ class Log:
             yield from read_database(self.path)
             return
         tracks: Iterable[Track] = (track for track, _ in self._rows())
-        if any(one.frame > other.frame for one, other in pairwise(tracks)):
-            tracks = sorted((track for track, _ in self._rows()), key=lambda track: track.frame)
-        else:
-            tracks = (track for track, _ in self._rows())
+        is_sorted = all(one.frame <= other.frame for one, other in pairwise(tracks))
+        tracks = (track for track, _ in self._rows())
+        tracks = tracks if is_sorted else sorted(tracks, key=lambda track: track.frame)
         for number, group in groupby(tracks, lambda track: track.frame):
             frame = TrackedFrame([*group])
             names = [track.object for track in frame.tracks]
@@ -389,9 +391,8 @@ class JoinedLog(Log):
                     raise VideoError(f"{log.path} has frame {frame.number} again: pass the files of one run")
                 last = frame.number
                 yield frame
-        self.damaged, self.gap = (
-            sum(each) for each in zip(*((log.damaged, log.gap) for log in self._logs), strict=True)
-        )
+        self.damaged = sum(log.damaged for log in self._logs)
+        self.gap = sum(log.gap for log in self._logs)
 
 
 def _parse_row(row: Row) -> Track:
@@ -457,9 +458,7 @@ class RunFiles:
     def position(self, *, skip_damaged: bool = False) -> tuple[int | None, float]:
         """Return the number of the frame after the last whole one of the log, and the seconds of that one.
 
-        None and 0 if there is to be no log.
-
-        VideoError if the log is damaged, unless damaged lines are skipped.
+        None and 0 if there is to be no log; VideoError if it is damaged, unless damaged lines are skipped.
         """
         if (path := self._log()) is None:
             return None, 0.0
@@ -576,7 +575,7 @@ class OpenFiles(AbstractContextManager["OpenFiles"]):
         except VideoError as error:
             if not self._is_live:
                 raise
-            self._warnings.failed(f"{error}; tracking continues, and missing frames are counted")
+            self._warnings.failed(str(error))
             return False
         return True
 
@@ -589,7 +588,7 @@ class OpenFiles(AbstractContextManager["OpenFiles"]):
                 try:
                     log.rotate(now)
                 except VideoError as error:
-                    self._warnings.failed(f"{error}; the log grows until it can be renamed")
+                    self._warnings.failed(str(error))
 
     def idle(self) -> None:
         """Tell the destinations that no frame has arrived for a while."""
