@@ -42,7 +42,7 @@ class _Connection:
 
     def __init__(self, channel: Channel[Any], about: str | None, newest: bool, endpoint: Endpoint) -> None:
         only = None if about is None else channel.messages[0]
-        self.endpoint = endpoint
+        self.endpoint, self._about = endpoint, about
         self.read = self.newest = 0.0
         self.state = ""
         self._health: Subscriber[Health] | None = None
@@ -59,6 +59,8 @@ class _Connection:
         for report in self._health.receive_all():
             if report.process == "detector":
                 self.newest, self.state = report.counters.get("time", self.newest), run_state(report.counters)[1]
+                if self._about is not None and self._about not in report.objects:
+                    self.state += f", without an object {self._about!r}"
 
     def close(self) -> None:
         for socket in (self.messages, self.ends, self._health):

@@ -198,6 +198,16 @@ def test_iteration_may_continue_after_a_timeout_and_the_end_counts_missed_frames
         assert subscription.losses() == "60 missed, 60 of them before this subscriber connected"
 
 
+def test_the_reason_of_a_silence_names_an_object_that_the_run_lacks(endpoint, turning):
+    with (
+        Publisher(HEALTH, endpoint, "detector") as health,
+        catstream.subscribe(str(endpoint), "tracks", object="ben", timeout=2) as subscription,
+    ):
+        health.send(Health("detector", 1.0, {}, objects={"anna": {}}))
+        with turning(health.serve_late_joiners), pytest.raises(SilenceError, match="running, without an object 'ben'"):
+            next(subscription)
+
+
 def test_async_for_gives_the_same_and_may_be_cancelled(endpoint, tracks):
     async def read(subscription):
         return [message.seq async for message in subscription]
