@@ -160,27 +160,24 @@ def check_results(videos: Iterable[Video], output: Path) -> None:
 
 
 class Batch:
-    """The videos of a batch, and the table batch.csv in the folder of the results, which may have rows of other ones.
+    """The videos of a batch, and the table batch.csv in the folder of the results.
 
-    rows  the row of each video; None before it is tracked, also if it failed earlier, had other boxes, or lacks a file
+    rows  the rows by video, also those of other tables; none of a video that failed, has other boxes, or lacks a file
     """
 
     def __init__(self, videos: Sequence[Video], output: Path, *, overwrite: bool) -> None:
         self.videos, self._output, self._table = videos, output, output / SUMMARIES
-        earlier = {row.video: row for row in read_summaries(self._table) if not row.error}
-        self.rows: list[Summary | None] = []
+        self.rows = {row.video: row for row in read_summaries(self._table) if not row.error}
         for video in videos:
-            row = earlier.pop(video.file, None)
-            files = _files(video, output, overwrite=True)
-            is_complete = row is not None and row.boxes == video.boxes and not files.missing() and not overwrite
-            self.rows.append(row if is_complete else None)
-        self._others = list(earlier.values())
+            missing = _files(video, output, overwrite=True).missing()
+            if video.file in self.rows and (overwrite or missing or self.rows[video.file].boxes != video.boxes):
+                del self.rows[video.file]
         self._write()
 
     @property
-    def missing(self) -> list[int]:
-        """The numbers of the videos that are still to be tracked."""
-        return [number for number, row in enumerate(self.rows) if row is None]
+    def missing(self) -> list[Video]:
+        """The videos that are still to be tracked."""
+        return [video for video in self.videos if video.file not in self.rows]
 
     def track(self, settings: Settings, jobs: int) -> Generator[Summary]:
         """Track the missing videos in `jobs` processes, and yield the row of each one after it was written.
@@ -190,32 +187,24 @@ class Batch:
         try:
             yield from self._track(self.missing, settings, jobs)
         except ServiceError:
-            for number in self.missing:
-                video = self.videos[number]
+            for video in self.missing:
                 try:
-                    yield from self._track([number], settings, 1)
+                    yield from self._track([video], settings, 1)
                 except ServiceError as error:
-                    yield self._add(
-                        number, Summary(video.file, len(video.keyframes), error=str(error), boxes=video.boxes)
-                    )
+                    yield self._add(Summary(video.file, len(video.keyframes), error=str(error), boxes=video.boxes))
 
-    def _track(self, numbers: Iterable[int], settings: Settings, jobs: int) -> Iterator[Summary]:
-        tasks = [(number, self.videos[number], self._output, settings) for number in numbers]
-        for number, row in run_tasks(_track_numbered, tasks, jobs):
-            yield self._add(number, row)
+    def _track(self, videos: Iterable[Video], settings: Settings, jobs: int) -> Iterator[Summary]:
+        for row in run_tasks(track_video, [(video, self._output, settings) for video in videos], jobs):
+            yield self._add(row)
 
-    def _add(self, number: int, row: Summary) -> Summary:
-        self.rows[number] = row
+    def _add(self, row: Summary) -> Summary:
+        self.rows[row.video] = row
         self._write()
         return row
 
     def _write(self) -> None:
-        rows = (row for row in (*self._others, *self.rows) if row is not None)
+        rows = sorted(self.rows.values(), key=lambda row: row.video)
         write_table(self._table, _COLUMNS, map(astuple, rows), VideoError)
-
-
-def _track_numbered(number: int, video: Video, output: Path, settings: Settings) -> tuple[int, Summary]:
-    return number, track_video(video, output, settings)
 
 
 def track_video(video: Video, output: Path, settings: Settings) -> Summary:
@@ -266,19 +255,14 @@ def _frames(video: Video, settings: Settings, stack: ExitStack) -> tuple[Head, I
     annotation = stack.enter_context(Annotation(str(video.path), several, settings, jobs=1))
     annotation.track()
     frames = annotation.frames
-    head = Head(
-        source=str(video.path),
-        size=frames.size,
-        rate=frames.rate,
-        frames=len(frames),
-        settings=tuple(annotation.settings.changed()),
-    )
+    changed = tuple(annotation.settings.changed())
+    head = Head(source=str(video.path), size=frames.size, rate=frames.rate, frames=len(frames), settings=changed)
 
     # Step 2: add the others from their boxes on. Their own run would begin at frame 0.
     def merged() -> Iterator[TrackedFrame]:
-        part, others = _tracked(video.path, single, settings, stack) if single else (Head(start=len(frames)), iter(()))
+        part, others = _tracked(video.path, single, settings, stack) if single else (Head(), iter(()))
         for number, tracks in enumerate(zip(*annotation.tracks.values(), strict=True)):
-            added = next(others).tracks if number >= part.start else ()
+            added = next(others, TrackedFrame([])).tracks if number >= part.start else ()
             shifted = (replace(track, frame=number, began=track.began + part.start) for track in added)
             yield TrackedFrame([*tracks, *shifted])
         next(others, None)  # raises the error of a box after the last frame

@@ -105,7 +105,7 @@ def batch(
                     console.print(f"{done} of {total} ({done / total:.0%}), {left} left: {row.video}: {result}")
     except KeyboardInterrupt:
         stopped("the results so far are saved; the same command continues")
-    summaries = [row for row in batch.rows if row is not None]
+    summaries = [batch.rows[video.file] for video in videos if video.file in batch.rows]
     _print(summaries)
     click.echo(f"results: {output}")
     if failed := sum(bool(row.error) for row in summaries):
