@@ -95,10 +95,7 @@ class Columns:
         return Row(dict(zip(self.names, values, strict=False)), self.separator)
 
     def _split(self, line: str) -> list[str]:
-        try:
-            (values,) = csv.reader([line.strip("\r\n")], delimiter=self.separator, skipinitialspace=True)
-        except csv.Error as error:
-            raise ValueError(str(error)) from None
+        (values,) = csv.reader([line.strip("\r\n")], delimiter=self.separator, skipinitialspace=True)
         return [value.strip() for value in values]
 
 

@@ -102,13 +102,9 @@ def export(
         exports.check_export(dest, form, overwrite=overwrite, log=file)
     for content in logs:
         path = content.path
-        about = About(
-            *(path.stem, content.head() or Head()),
-            label=label,
-            classes=classes,
-            prefix=f"{path.stem}_" if len(logs) > 1 else "",
-            is_first=content is logs[0],
-        )
+        about = About(path.stem, content.head() or Head(), label=label, classes=classes, is_first=content is logs[0])
+        if len(logs) > 1:
+            about = replace(about, prefix=f"{path.stem}_")
         about = _with_source(about, path, source, required=images, useful=form.images)
         if note := exports.export(content, dest, form, about):
             click.echo(note, err=True)

@@ -471,17 +471,16 @@ class RunFiles:
 
     def is_complete(self, frames: int | None) -> bool:
         """Return whether all destinations, at least one, are files that have this number of frames, None if unknown."""
-        for place in self.places:
-            count = None
+
+        def count(place: str) -> int | None:
             if is_log(Path(place)):
                 last, _ = Log(Path(place), skip_damaged=True).last_whole_frame()
-                count = None if last is None else last.number + 1
-            elif is_file(place):
-                with suppress(VideoError), open_source(place) as video:
-                    count = video.frames
-            if count is None or count != frames:
-                return False
-        return bool(self.places)
+                return last and last.number + 1
+            with suppress(VideoError), open_source(place) as video:
+                return video.frames
+            return None
+
+        return frames is not None and {*map(count, self.places)} == {frames}
 
     def opened(self, endpoint: str, *, resume: bool = False, skip_damaged: bool = False) -> OpenFiles:
         """Open all destinations beside a pipeline; existing files are replaced.
