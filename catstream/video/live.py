@@ -193,7 +193,8 @@ class LiveSource(Source):
                 self._store_newest(monotonic(), decoded)
                 frames += 1
         except av.FFmpegError as error:
-            if monotonic() - max(begin, self._last_frame_time) >= self._settings.read_timeout_seconds:
+            silence = monotonic() - max(begin, self._last_frame_time)
+            if isinstance(error, av.ExitError) or silence >= self._settings.read_timeout_seconds:
                 return Loss("silent", frames, _SILENT)  # FFmpeg's messages for a timeout are unclear
             if isinstance(error, av.InvalidDataError):
                 return Loss("invalid", frames, _INVALID)

@@ -160,6 +160,13 @@ def test_an_unreachable_stream_is_an_error_without_its_password(camera, caplog):
     assert not caplog.records, "a first failure is an error, not a loss"
 
 
+def test_a_camera_that_is_silent_at_the_start_is_an_error_that_names_the_timeouts(camera):
+    cam = camera(numbered)
+    cam.sends.clear()
+    with pytest.raises(VideoError, match=r"\(no data\): check the camera; if it is slow, raise run\."):
+        open_source(cam.url, open_timeout_seconds=1)
+
+
 @pytest.mark.parametrize(
     ("seconds", "left_out", "late"),
     [(0.03, (0, 0), 0.1), (0.08, (0.4, 0.7), 2.1), (0.5, (0.9, 0.97), 2.6)],
