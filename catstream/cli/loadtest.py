@@ -29,8 +29,6 @@ if TYPE_CHECKING:
     from catstream.loadtest.result import Limit, Result
 
 _QUIET_CORES = 0.25  # load by other processes above which a warning is printed
-#: Limits of a search if none are given.
-_SEARCH_LIMITS = ("p99=0.1", "skipped=0")
 
 
 def _size(_: click.Context, __: click.Parameter, text: str) -> tuple[int, int]:
@@ -101,7 +99,7 @@ def loadtest(
     from catstream.loadtest.load_test import run_load_test
     from catstream.loadtest.result import Limit, Plan, violations
 
-    parsed = [Limit.parse(text) for text in limits or (_SEARCH_LIMITS if find_streams else ())]
+    parsed = [Limit.parse(text) for text in limits or (("p99=0.1", "skipped=0") if find_streams else ())]
     parameters = Plan(**plan)
     with line_of(
         messages(), text("{task.description}"), BarColumn(24), text("{task.fields[figures]}", last=True)

@@ -339,6 +339,7 @@ def _doubtful(boxes: Mapping[str, Box], width: int, height: int) -> list[str]:
         for name, (x, y, w, h) in boxes.items()
         if 0 <= x < w <= width
         and 0 <= y < h <= height
+        and x + y > 0
         and (x + w > width or y + h > height or 4 * w * h > width * height)
     ]
     return doubts + [
