@@ -21,7 +21,7 @@ class _Frames(VideoFrames):
     def __init__(self, folder: Path, settings: RunSettings) -> None:
         self.name, self.rate, self.size, self.times = "", 0.0, (0, 0), np.zeros(0)
         self.counters, self.is_exact = {}, True
-        self._folder, self._settings = folder, settings
+        self._folder, self.settings = folder, settings
         self._videos: list[tuple[str, tuple[int, int]]] = []
 
     def append(self, file: str) -> None:
@@ -42,7 +42,7 @@ class _Frames(VideoFrames):
         pass
 
     def _opened(self, file: str) -> VideoFrames:
-        return VideoFrames(self._folder / file, slice(0, 1), self._settings)
+        return VideoFrames(self._folder / file, slice(0, 1), self.settings)
 
 
 class FirstFrames(Annotation):

@@ -18,6 +18,7 @@ from catstream.base.box import Box
 from catstream.base.names import UNNAMED
 from catstream.base.settings import Settings
 from catstream.base.threads import one_thread
+from catstream.base.workers import release_memory
 from catstream.compression.forest import Forest
 from catstream.detection.objects import Detectors
 from catstream.errors import BoxError
@@ -31,6 +32,8 @@ from catstream.video.video_frames import VideoFrames
 #: The boxes of an object at its keyframes, by number of the frame; None where it is absent.
 Keyframes = Mapping[int, Box | None]
 
+
+_TRIMMED = 32  #: frames after which the memory of searches of whole frames is returned
 
 _NEAR = 0.4  #: IoU with the box of a keyframe, above which a pass has not lost the object there
 
@@ -138,6 +141,8 @@ def _images(frames: VideoFrames, numbers: Iterable[int], count: Path | None) -> 
             file = os.open(count, os.O_WRONLY | os.O_APPEND)
             os.write(file, b".")
             os.close(file)
+        if number % _TRIMMED == 0:
+            release_memory()
         yield frames[number]
 
 

@@ -67,6 +67,7 @@ class Session:
         self._wakes, self._closed, self._is_damaged = True, False, False
         self._thread = threading.Thread(target=self._run, name="session", daemon=True)
         annotation.progress = self._check_closed
+        annotation.frames.is_threaded = True  # for the pictures of the page
 
     def __enter__(self) -> Self:
         self._thread.start()

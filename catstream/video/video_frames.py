@@ -58,17 +58,13 @@ class _Index:
 
     times      float64 (frames,), seconds
     packets    int (frames,), number of the packet of each frame; -1 if the decoder does not state it
-    positions  int (packets,), place in the file in bytes
-    stamps     int (packets,), time stamps of presentation in ticks
-    sizes      int (packets,), bytes
+    identities int (packets, 3), of each packet its place in the file, time stamp of presentation in ticks, and size
     keys       int, numbers of the packets that are keyframes
     """
 
     times: Float64
     packets: np.ndarray
-    positions: np.ndarray
-    stamps: np.ndarray
-    sizes: np.ndarray
+    identities: np.ndarray
     keys: np.ndarray
 
     @cached_property
@@ -79,7 +75,7 @@ class _Index:
     @cached_property
     def numbers(self) -> np.ndarray:
         """The number of the frame of each packet, -1 without one."""
-        numbers = np.full(len(self.sizes), -1)
+        numbers = np.full(len(self.identities), -1)
         numbers[self.packets] = np.arange(len(self.packets))
         return numbers
 
@@ -94,8 +90,7 @@ class _Index:
 
     def find(self, packet: Packet[Any]) -> int | None:
         """The number of a packet that is read after a seek; None if it is not certain."""
-        position, stamp, size = _identity(packet)
-        found = np.flatnonzero((self.positions == position) & (self.stamps == stamp) & (self.sizes == size))
+        found = np.flatnonzero((self.identities == _identity(packet)).all(axis=1))
         return int(found[0]) if len(found) == 1 else None
 
 
@@ -108,7 +103,7 @@ class _Packets:
     """Collects the columns of an index while the packets of a file are read."""
 
     def __init__(self) -> None:
-        self.identities = array("q"), array("q"), array("q")
+        self.identities = array("q")
         self.keys, self.discarded = array("b"), array("b")
         self.damages = array("q")  # numbers of the packets at which damage was noticed, once for each lost frame
 
@@ -116,18 +111,16 @@ class _Packets:
         return len(self.keys)
 
     def append(self, packet: Packet[Any]) -> None:
-        for column, value in zip(self.identities, _identity(packet), strict=True):
-            column.append(value)
+        self.identities.extend(_identity(packet))
         self.keys.append(packet.is_keyframe)
         self.discarded.append(packet.is_discard)
 
     def index(self, times: array[float], packets: np.ndarray | array[int]) -> _Index:
-        positions, stamps, sizes = map(np.array, self.identities)
         keys = np.flatnonzero(np.array(self.keys))
         # Around damage, which is noticed late, the picture of a keyframe may depend on earlier ones.
         noticed = np.searchsorted(np.array(self.damages), [0, *keys, len(self), len(self)])
         keys = keys[noticed[:-3] == noticed[3:]]
-        return _Index(np.array(times), np.array(packets), positions, stamps, sizes, keys)
+        return _Index(np.array(times), np.array(packets), np.array(self.identities).reshape(-1, 3), keys)
 
 
 class VideoFrames:
@@ -143,25 +136,27 @@ class VideoFrames:
     Attributes
     ----------
     name, rate, size, counters : as of a `Source`
+    settings : as of the parameters
     times : float64, seconds of the frames that are numbered so far; before `scan`, of the first one
+    is_threaded : whether the decoder uses several threads, for a short latency; not in a pickled copy
     is_exact : whether all frames were decoded; if not, an image may raise VideoError, because its file is damaged
     """
 
     def __init__(self, text: str | Path, part: slice = ALL_FRAMES, settings: RunSettings | None = None) -> None:
-        self._settings, self._part = settings or RunSettings(), part
-        with open_source(text, part=part, settings=self._settings) as source:
+        self.settings, self._part = settings or RunSettings(), part
+        with open_source(text, part=part, settings=self.settings) as source:
             assert isinstance(source, FileSource)
             first = next(source)
             self._source = source.reader if isinstance(source.reader, Images) else source.reader.path
         self.name, self.rate, self.size, self.counters = source.name, source.rate, source.size, source.counters
-        self.times, self.is_exact = np.array([first.time]), False
+        self.times, self.is_exact, self.is_threaded = np.array([first.time]), False, False
         self._first: UInt8 | None = first.image
         self._index: _Index | None = None
         self._lock = threading.Lock()
         self._reader: _Reader | None = None
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_lock": None, "_reader": None, "_first": None}
+        return {**self.__dict__, "is_threaded": False, "_lock": None, "_reader": None, "_first": None}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state, _lock=threading.Lock())
@@ -179,7 +174,7 @@ class VideoFrames:
                 assert self._first is not None
                 return self._first
             if self._reader is None:
-                self._reader = _Reader(self._source, self._settings, self._index, (height, width, 3), self.is_exact)
+                self._reader = _Reader(self, self._source, self._index)
             return self._reader.image(range(len(self._index.packets))[self._part][number])
 
     def size_of(self, number: int) -> tuple[int, int]:  # noqa: ARG002  # of first frames, each has its own
@@ -198,7 +193,7 @@ class VideoFrames:
         try:
             if isinstance(self._source, Images):
                 self._scan_images(self._source, progress, exact=exact)
-            elif exact or self._settings.skip_damaged or not self._scan_packets(self._source, progress):
+            elif exact or self.settings.skip_damaged or not self._scan_packets(self._source, progress):
                 self._decode_all(self._source, progress)
         except VideoError as error:
             raise VideoError(f"{counted(len(self), 'frame')} could be read: {error}") from None
@@ -215,7 +210,7 @@ class VideoFrames:
 
     def _scan_packets(self, path: Path, progress: Progress) -> bool:
         """Number the frames by the time stamps of the packets; return False if that is not certain."""
-        video, packets = VideoFile(path, self._settings), _Packets()
+        video, packets = VideoFile(path, self.settings), _Packets()
         containers, codec = video.container.format.name.split(","), video.stream.codec_context.codec.canonical_name
         with video.container:
             if codec not in _CODECS or not set(containers) & set(_CONTAINERS):
@@ -228,8 +223,8 @@ class VideoFrames:
                     if len(packets) % _INTERVAL == 0:
                         progress(len(packets), None)
             time_base = video.stream.time_base
-            video.set_end(float(max(packets.identities[1]) * time_base))
-        _, stamps, _ = map(np.array, packets.identities)
+            video.set_end(float(max(packets.identities[1::3]) * time_base))
+        stamps = np.array(packets.identities[1::3])
         shown, keys = np.array(packets.discarded) == 0, np.array(packets.keys) == 1
         ordered = np.flatnonzero(shown)[stamps[shown].argsort(kind="stable")]
         # A frame is between the keyframes around its own: time stamps do not begin again, and none leads the first one.
@@ -249,7 +244,7 @@ class VideoFrames:
 
     def _decode_all(self, path: Path, progress: Progress) -> None:
         """Number the frames that FFmpeg decodes: a frame has the time stamp of its packet, which is its number here."""
-        video, packets, stop = VideoFile(path, self._settings), _Packets(), range(sys.maxsize)[self._part].stop
+        video, packets, stop = VideoFile(path, self.settings), _Packets(), range(sys.maxsize)[self._part].stop
         times, packet_numbers, upright = array("d"), array("q"), UprightConverter()
         total = video.count()
         total = total and len(range(total)[self._part])
@@ -266,7 +261,7 @@ class VideoFrames:
             for frame in video.decoded(numbered()):
                 number = -1 if frame.pts is None else frame.pts
                 packet_numbers.append(number)
-                stamp = packets.identities[1][number]
+                stamp = packets.identities[3 * number + 1]
                 frame.pts = None if number < 0 or stamp == _NO_STAMP else stamp
                 yield frame
 
@@ -280,7 +275,7 @@ class VideoFrames:
                     first = first or (frame.width, frame.height)
                     if (frame.width, frame.height) != first:
                         width, height = self.size
-                        of_one_size(upright(frame), (height, width, 3), self._settings.resize, path, len(times))
+                        of_one_size(upright(frame), (height, width, 3), self.settings.resize, path, len(times))
                         video.scaled += 1
                     times.append(time)
                     if len(times) % _INTERVAL == 0 and len(times) > 1.5 * len(self):
@@ -298,17 +293,22 @@ class VideoFrames:
 class _Reader:
     """Decodes the frames of a file by their number in it, with a cache; it is not thread-safe."""
 
-    def __init__(
-        self, path: Path, settings: RunSettings, index: _Index, shape: tuple[int, ...], is_exact: bool
-    ) -> None:
-        self._path, self._settings, self._index, self._shape, self._is_exact = path, settings, index, shape, is_exact
-        self._upright, self._video = UprightConverter(), VideoFile(path, settings)
+    def __init__(self, frames: VideoFrames, path: Path, index: _Index) -> None:
+        self._path, self._index, self._settings, (width, height) = path, index, frames.settings, frames.size
+        self._shape, self._is_exact, self._is_threaded = (height, width, 3), frames.is_exact, frames.is_threaded
+        self._upright, self._video = UprightConverter(), self._opened()
         pixels = self._video.stream.codec_context.format
         bits = (pixels and pixels.padded_bits_per_pixel) or 24
-        self._capacity = max(2, 8 * _CACHE_BYTES // (shape[0] * shape[1] * bits))
+        self._capacity = max(2, 8 * _CACHE_BYTES // (width * height * bits))
         self._cache: dict[int, VideoFrame] = {}
         self._run: Iterator[tuple[int, VideoFrame]] = iter(())
         self._next = 0  # number of the frame that follows in the run
+
+    def _opened(self) -> VideoFile:
+        video = VideoFile(self._path, self._settings)
+        if self._is_threaded and not self._settings.skip_damaged:
+            video.stream.thread_type = "AUTO"
+        return video
 
     def image(self, number: int) -> UInt8:
         if number not in self._cache:
@@ -320,8 +320,10 @@ class _Reader:
         """Put a frame into the cache, and as many before it as it holds, unless it follows in the run."""
         starts = self._index.starts
         place = bisect_right(starts, number, key=itemgetter(0)) - 1
-        if starts[place][0] <= self._next <= number and self._advance(number):
-            return
+        if starts[place][0] <= self._next <= number:
+            self._cache.clear()  # reading forwards needs none
+            if self._advance(number):
+                return
         begin, problem = max(starts[place][0], number - self._capacity + 1), None
         # A decoder may need more than one keyframe before its pictures are complete.
         for attempt in dict.fromkeys(max(0, place - back) for back in (0, 1, 2, place if self._is_exact else 0)):
@@ -347,7 +349,7 @@ class _Reader:
         return False
 
     def _frames(self, first: int, begin: int) -> Iterator[tuple[int, VideoFrame]]:
-        """Decode from packet `first` on; yield the frames from number `begin` on, with their numbers.
+        """Decode from packet `first` on; yield the frames from number `begin` on.
 
         The time stamp of a packet, which its frame inherits, is replaced by its number. Frames before `begin` are not
         decoded if no other one refers to them.
@@ -368,7 +370,7 @@ class _Reader:
                         packet.pts = number
                         yield packet
                     number += 1
-                    if number == len(index.sizes):
+                    if number == len(index.identities):
                         break
                 elif number > first:
                     yield packet
@@ -392,12 +394,12 @@ class _Reader:
         before = int(np.searchsorted(self._index.keys, first, "right")) if first else 0
         for key in self._index.keys[:before][::-1][:_ATTEMPTS]:
             with suppress(av.FFmpegError):
-                self._video.container.seek(int(self._index.stamps[key]), stream=self._video.stream)
+                self._video.container.seek(int(self._index.identities[key, 1]), stream=self._video.stream)
                 packets = self._video.packets()
                 for packet in islice(packets, _ATTEMPTS):
                     number = None if packet is None or isinstance(packet, str) else self._index.find(packet)
                     if number is not None and number <= first:
                         return number, chain([packet], packets)
         self._video.container.close()
-        self._video = VideoFile(self._path, self._settings)
+        self._video = self._opened()
         return 0, self._video.packets()
