@@ -191,7 +191,7 @@ export class StreamPage {
     const last = source.includes("://") ? source : source.split("/").filter(Boolean).at(-1) || source;
     const shown = [this.name, /^\d+$/.test(last) ? `camera ${last}` : last || (this.name ? "" : endpoint)].filter(Boolean).join(", ");
     write($("#source"), shown && `${shown}${(skipped ?? null) === null ? "" : `, ${skipped} frames skipped`}`);
-    $("#source").title = source && endpoint ? `${source}, followed by the pipeline at ${endpoint}` : "";
+    $("#source").title = source && endpoint ? `${source}, tracked by the pipeline at ${endpoint}` : "";
     document.title = shown ? `${this.name || shown} – catstream` : "catstream";
   }
 
