@@ -150,7 +150,7 @@ def check_results(videos: Iterable[Video], output: Path) -> None:
         log = output / f"{video.name}.ndjson"
         if not (output / SUMMARIES).exists():
             _files(video, output, overwrite=False)
-        elif log.exists():
+        elif log.exists() and log.stat().st_size:  # an emptied log is tracked again, as a removed one
             source = (Log(log).head() or Head()).source
             if os.path.realpath(source) != os.path.realpath(video.path):
                 raise VideoError(
@@ -169,8 +169,9 @@ class Batch:
         self.videos, self._output, self._table = videos, output, output / SUMMARIES
         self.rows = {row.video: row for row in read_summaries(self._table) if not row.error}
         for video in videos:
-            missing = _files(video, output, overwrite=True).missing()
-            if video.file in self.rows and (overwrite or missing or self.rows[video.file].boxes != video.boxes):
+            files, row = _files(video, output, overwrite=True), self.rows.get(video.file)
+            is_missing = any(not Path(place).exists() or not Path(place).stat().st_size for place in files.places)
+            if row is not None and (overwrite or is_missing or row.boxes != video.boxes):
                 del self.rows[video.file]
         self._write()
 

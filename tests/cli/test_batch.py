@@ -1,8 +1,10 @@
 """`catstream batch`: the logs of many videos, what is not tracked again, and one data set of all."""
 
 import csv
+import os
 import signal
 from dataclasses import replace
+from pathlib import Path
 
 import psutil
 import pytest
@@ -102,9 +104,10 @@ def test_results_of_another_table_are_not_replaced_and_its_rows_stay(demo, batch
     assert Log(tmp_path / "out" / "two_cam.ndjson").head().source == f"{tmp_path}/three/two/cam.mp4"
 
 
-def test_a_video_whose_log_was_removed_is_tracked_again(demo, batch, tmp_path):
+@pytest.mark.parametrize("spoil", [Path.unlink, lambda log: os.truncate(log, 0)], ids=["removed", "emptied"])
+def test_a_video_whose_log_was_removed_or_emptied_is_tracked_again(demo, batch, tmp_path, spoil):
     batch(f"two/cam.mp4,anna,{demo[0]},")
-    (tmp_path / "out" / "two_cam.ndjson").unlink()
+    spoil(tmp_path / "out" / "two_cam.ndjson")
     batch(f"./two/cam.mp4,anna,{demo[0]},")
     assert sum(1 for _ in Log(tmp_path / "out" / "two_cam.ndjson")) == FRAMES
 
