@@ -28,7 +28,8 @@ from catstream.video.source import open_source
 
 _PICTURES = 8  #: most frames to look at in a video
 _SIDE = 480  #: of a picture, pixels
-_BINS = 200  #: of the plot of the speed
+_POINTS = 1000  #: of a curve, at most
+_BINS = 200  #: stretches of a video, of which the plot has mean speeds
 _SPEED_SECONDS = 0.25  #: of which a speed is the mean, at least
 _GAP_SECONDS = 1.0  #: without a frame, from which the source was lost, if it is also five intervals
 
@@ -101,10 +102,8 @@ class _Object:
         distance, tracked = np.nansum(self.steps), np.diff(self.times)[~np.isnan(self.steps)].sum()
         shares = [float(np.mean(self.states == state)) for state in ("present", "doubtful", "absent")]
         seconds = (self.ends - self.times)[self.states != "absent"].sum()
-        mean = fastest = distance / (tracked or np.nan)
-        if tracked and (window := max(1, round(_SPEED_SECONDS / self.interval))) < len(self.steps):
-            sums = (np.convolve(values, np.ones(window), "valid") for values in (self.steps, np.diff(self.times)))
-            fastest = np.fmax.reduce(np.divide(*sums), initial=mean)
+        mean, (_, speeds) = distance / (tracked or np.nan), self.speeds(_SPEED_SECONDS)
+        fastest = np.fmax.reduce(speeds, initial=mean)
         return [len(self.states), *shares, self._checked, seconds, distance, mean, fastest]
 
     def lane(self, start: float, end: float) -> list[tuple[str, float, float, str]]:
@@ -117,14 +116,16 @@ class _Object:
             bars.append((state, scale * (first - start), scale * (last - first), text))
         return bars
 
-    def speeds(self, edges: Float64) -> Float64:
-        """Mean speed per second between neighbours of `edges`, seconds; NaN while it is absent."""
-        tracked = ~np.isnan(self.steps)
-        middles, seconds = ((self.times[1:] + self.times[:-1]) / 2)[tracked], np.diff(self.times)[tracked]
-        distances, _ = np.histogram(middles, edges, weights=self.steps[tracked])
-        durations, _ = np.histogram(middles, edges, weights=seconds)
-        speeds: Float64 = np.where(durations > 0, distances / np.where(durations > 0, durations, 1), np.nan)
-        return speeds
+    def speeds(self, seconds: float) -> tuple[Float64, Float64]:
+        """The middles of all stretches of these seconds, and the mean speed in each; NaN if a part of it is unknown."""
+        if len(self.steps) < (window := max(1, round(seconds / self.interval))):
+            return np.empty(0), np.empty(0)
+        known = ~np.isnan(self.steps)
+        rows = np.cumsum([np.where(known, self.steps, 0), np.diff(self.times), ~known], axis=1)
+        sums = np.pad(rows, [(0, 0), (1, 0)])
+        distances, durations, unknown = sums[:, window:] - sums[:, :-window]
+        durations[(unknown > 0) | (durations <= 0)] = np.nan
+        return (self.times[window:] + self.times[:-window]) / 2, distances / durations
 
 
 class Section:
@@ -189,18 +190,17 @@ class Section:
     def _speeds(self) -> tuple[dict[str, list[str]], float]:
         """The polylines of the speed of each object in a plot of 1000 x 460, and the speed at its upper end."""
         duration = self.end - self.start
-        width = max(_SPEED_SECONDS, *(2 * item.interval for item in self._objects.values()))
-        edges = np.linspace(self.start, self.end, min(_BINS, max(2, int(duration / width))) + 1)
-        speeds = {name: item.speeds(edges) for name, item in self._objects.items()}
-        fastest = max(self._scale.size, *(float(np.nanmax(item, initial=0)) for item in speeds.values()))
+        speeds = {name: item.speeds(max(_SPEED_SECONDS, duration / _BINS)) for name, item in self._objects.items()}
+        fastest = max(self._scale.size, *(np.fmax.reduce(values, initial=0) for _, values in speeds.values()))
         step = 10 ** np.floor(np.log10(fastest)) / 2
         top = step * np.ceil(fastest / step)  # a round number
-        xs = 1000 * ((edges[1:] + edges[:-1]) / 2 - self.start) / duration
         lines = {}
-        for name, values in speeds.items():
-            points = np.column_stack([xs, 460 - 440 * values / top])
-            parts = np.split(points, np.flatnonzero(np.diff(np.isnan(values))) + 1)
-            lines[name] = [" ".join(f"{x:.1f},{y:.1f}" for x, y in part) for part in parts if not np.isnan(part[0, 1])]
+        for name, (middles, values) in speeds.items():
+            points = np.column_stack([1000 * (middles - self.start) / duration, 460 - 440 * values / top])
+            points = points[:: len(points) // _POINTS + 1]
+            parts = np.split(points, np.flatnonzero(np.diff(np.isnan(points[:, 1]))) + 1)
+            shown = (part for part in parts if len(part) and not np.isnan(part[0, 1]))
+            lines[name] = [" ".join(f"{x:.1f},{y:.1f}" for x, y in part) for part in shown]
         return lines, float(top)
 
 

@@ -94,7 +94,7 @@ def test_the_logs_of_a_folder_have_a_section_each_and_names_are_escaped(succeed,
     succeed("report", tmp_path)
     page = (tmp_path / "report.html").read_text()
     assert re.findall(r"<h2>(.*?) <small>", page) == ["a&amp;b", "c"]
-    assert len(re.findall("<polyline", page)) == 3 * 2
+    assert len(re.findall("<polyline", page)) == 3  # two frames after the absence are too few for a mean
 
 
 def test_rotated_logs_are_one_section_in_which_frames_that_are_not_written_are_a_gap(succeed, tmp_path):
