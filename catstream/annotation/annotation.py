@@ -421,7 +421,10 @@ def _work(
     task: Task, frames: VideoFrames, settings: Settings, models: Path, count: Path | None = None
 ) -> tuple[Task, Pass | None]:
     way = task.start, task.stop, dict(task.keyframes)
-    return task, run_pass(frames, *way, settings, models, use_memory=task.use_memory, count=count)
+    try:
+        return task, run_pass(frames, *way, settings, models, use_memory=task.use_memory, count=count)
+    finally:
+        frames.close()
 
 
 def _parsed(boxes: KeyframeBoxes) -> dict[str, dict[int, KeyframeBox]]:

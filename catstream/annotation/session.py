@@ -13,6 +13,7 @@ from catstream.annotation.keyframes import KeyframeBox
 from catstream.annotation.object_tracks import ObjectTracks
 from catstream.base.arrays import UInt8
 from catstream.base.box import Box
+from catstream.base.workers import release_memory
 from catstream.errors import CatstreamError, CommandRejectedError, ObjectError, VideoError
 
 #: Passes of more frames have processes of their own, so that a correction of a short stretch does not wait for them.
@@ -197,6 +198,7 @@ class Session:
         except VideoError as error:
             self.problem = error
         self.annotation.scan()
+        release_memory()
         self.decoded = True
         self._wake()
 

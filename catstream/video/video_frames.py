@@ -46,7 +46,7 @@ _VERIFIED = 8  #: frames that are decoded to verify this
 #: Decoders that can skip each frame to which no other one refers.
 _SKIPPABLE = ("h264", "mpeg2video", "mpeg4")
 
-_CACHE_BYTES = 64 << 20  #: of decoded frames, in the pixel format of the video
+_CACHE_BYTES = 32 << 20  #: of decoded frames, in the pixel format of the video
 _NO_STAMP = -(1 << 63)
 _ATTEMPTS = 5  #: seeks to earlier and earlier keyframes, and packets after each, until one is known
 _INTERVAL = 256  #: packets between two calls of a `Progress`
@@ -182,8 +182,9 @@ class VideoFrames:
         return self.size
 
     def close(self) -> None:
+        """Free the decoder and its cache; the next image opens the file again."""
         with self._lock:
-            self._reader = None
+            self._close_reader()
 
     def scan(self, progress: Progress = lambda *_: None, *, exact: bool = False) -> None:
         """Number the frames: from the packets if that is certain, else, or if `exact`, by decoding all.
@@ -286,8 +287,14 @@ class VideoFrames:
 
     def _publish(self, index: _Index, counters: dict[str, float], *, exact: bool = False) -> None:
         with self._lock:
-            self._index, self._reader, self.is_exact, self.counters = index, None, exact, counters
+            self._close_reader()
+            self._index, self.is_exact, self.counters = index, exact, counters
             self.times = index.times[self._part]
+
+    def _close_reader(self) -> None:
+        if self._reader is not None:
+            self._reader.close()
+        self._reader = None
 
 
 class _Reader:
@@ -303,6 +310,10 @@ class _Reader:
         self._cache: dict[int, VideoFrame] = {}
         self._run: Iterator[tuple[int, VideoFrame]] = iter(())
         self._next = 0  # number of the frame that follows in the run
+
+    def close(self) -> None:
+        self._run = iter(())  # it refers to this reader, whose memory would only be freed by a garbage collection
+        self._video.container.close()
 
     def _opened(self) -> VideoFile:
         video = VideoFile(self._path, self._settings)
