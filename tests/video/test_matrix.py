@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from catstream.video.source import open_source
+from catstream.video.video_frames import VideoFrames
 
 pytestmark = [
     pytest.mark.system,
@@ -146,6 +147,10 @@ def test_all_frames_and_their_times_are_those_that_ffmpeg_says(tmp_path, picture
         numbers, times = read(path)
         compared(times, said(path) if container not in RAW else [number / RATE for number in range(FRAMES)])
         assert numbers == list(wanted or range(numbers[0], numbers[0] + len(times))), path.name
+        frames = VideoFrames(path)
+        frames.scan()
+        assert list(frames.times) == times
+        assert [number_of(frames[number]) for number in reversed(range(len(frames)))] == numbers[::-1]
 
 
 def test_the_table_of_the_how_to_lists_what_is_compared():
