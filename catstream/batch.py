@@ -16,7 +16,7 @@ from typing import NamedTuple
 from msgspec import convert
 
 from catstream.annotation.annotation import Annotation
-from catstream.annotation.keyframes import Keyframe, KeyframeBox, by_object, cells, format_keyframe, parse_row
+from catstream.annotation.keyframes import Keyframe, KeyframeBox, by_object, format_keyframe, parse_row
 from catstream.base.box import Box
 from catstream.base.settings import Settings
 from catstream.base.tables import Row, read_table, write_table
@@ -111,12 +111,6 @@ def read_boxes(table: Path) -> dict[str, list[Keyframe]]:
     for file, keyframe in read_table(table, ("file", "object", "x", "y", "w", "h"), parse):
         boxes.setdefault(file, []).append(keyframe)
     return boxes
-
-
-def write_boxes(table: Path, boxes: Mapping[str, Iterable[Keyframe]]) -> None:
-    """Write a table that `read_boxes` reads, atomically."""
-    rows = ((file, name, *cells(box), frame) for file, drawn in boxes.items() for name, frame, box in drawn)
-    write_table(table, ("file", "object", "x", "y", "w", "h", "frame"), rows, VideoError)
 
 
 def videos_of(table: Path, boxes: Mapping[str, Iterable[Keyframe]]) -> list[Video]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import Future
 from contextlib import closing
 from dataclasses import dataclass, field
@@ -100,7 +100,6 @@ class Annotation:
     keyframes : dict of the boxes of each object, by name and frame
     counters : counters of the video by name, see `catstream.video.frames.describe_counters`
     progress : as of the parameters
-    videos : paths of the videos if each frame is of another one, see `FirstFrames`
 
     Raises
     ------
@@ -111,8 +110,6 @@ class Annotation:
     ObjectError
         For a name that is not valid, an object without a box, or too many.
     """
-
-    videos: Sequence[str] = ()
 
     def __init__(
         self,
@@ -151,10 +148,14 @@ class Annotation:
         count = sum(map(len, self.keyframes.values()))
         return f"<catstream.Annotation of {self.frames.name}: {count} boxes, {self.share_checked:.0%} checked>"
 
-    def close(self) -> None:
-        """End the processes and close the video; `add` and `track` cannot be called any more."""
+    def stop(self) -> None:
+        """End the processes and close the video, until a method needs them again."""
         self._workers.kill()
         self.frames.close()
+
+    def close(self) -> None:
+        """End the processes and close the video; `add` and `track` cannot be called any more."""
+        self.stop()
         self._folder.cleanup()
 
     def add(self, frame: int, box: str | Iterable[float] | None, object: str = UNNAMED) -> None:
@@ -194,7 +195,13 @@ class Annotation:
             self._passes.clear()
             self._fusions.clear()
             self.progress("reading", len(self.frames), None)
-            self.frames.scan(lambda *done: self.progress("reading", *done), exact=exact)
+            try:
+                self.frames.scan(lambda *done: self.progress("reading", *done), exact=exact)
+            except VideoError:
+                raise
+            except BaseException:  # interrupted by `progress`
+                self._is_scanned = False
+                raise
         self._check(self.keyframes)
 
     def track(self) -> None:

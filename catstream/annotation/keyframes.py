@@ -6,6 +6,7 @@ covered to draw a box.
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -26,7 +27,7 @@ KeyframeBox = Box | Literal["hidden"] | None
 #: Name of an object, number of a frame, and the box of the object there.
 Keyframe = tuple[str, int, KeyframeBox]
 
-_HEADER = ("frame", "object", "x", "y", "w", "h")
+_HEADER = ("frame", "object", "x", "y", "w", "h", "file")
 
 
 def parse_keyframe(text: str) -> Keyframe:
@@ -54,7 +55,7 @@ def format_keyframe(name: str, frame: int, box: KeyframeBox) -> str:
 
 def read_keyframes(path: Path) -> list[Keyframe]:
     """Read a table with the columns frame, object, x, y, w, h; VideoError if it cannot be read or is malformed."""
-    return read_table(path, _HEADER, parse_row)
+    return read_table(path, _HEADER[:-1], parse_row)
 
 
 def parse_row(row: Row, frame: int | None = None) -> Keyframe:
@@ -66,10 +67,11 @@ def parse_row(row: Row, frame: int | None = None) -> Keyframe:
     return check_name(row.text("object")), number, box
 
 
-def write_keyframes(path: Path, keyframes: Mapping[str, Mapping[int, KeyframeBox]]) -> None:
-    """Write the file that `read_keyframes` reads, atomically, in the order of the frames."""
+def write_keyframes(path: Path, keyframes: Mapping[str, Mapping[int, KeyframeBox]], video: str = "") -> None:
+    """Write the file that `read_keyframes` reads, atomically, in the order of the frames; a batch reads it as well."""
+    file = video and os.path.relpath(video, path.parent)
     places = sorted((frame, name) for name, drawn in keyframes.items() for frame in drawn)
-    rows = ([frame, name, *cells(keyframes[name][frame])] for frame, name in places)
+    rows = ([frame, name, *cells(keyframes[name][frame]), file] for frame, name in places)
     write_table(path, _HEADER, rows, VideoError)
 
 

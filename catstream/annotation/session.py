@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
 from pathlib import Path
 from typing import Any, Self
@@ -31,14 +31,15 @@ class Session:
     """Changes the boxes of an annotation, while a thread reads the video and runs the missing passes.
 
     Objects take turns, beginning with the object of the newest box; the passes of the newest box of each run first. The
-    methods may be called from any thread. Use it in a `with`; the owner of the annotation closes it afterwards.
+    methods may be called from any thread. Use it in a `with`, also more than once: it goes on where it was. The owner
+    of the annotation closes it afterwards.
 
     Parameters
     ----------
     annotation : Annotation whose frames are not numbered yet
     jobs : number of passes that run at a time, and as many long ones beside them
     save : function that is called after each change of the keyframes
-    write : function that is called by `finish`, for the results
+    write : function that writes the results; called by `finish`
 
     Attributes
     ----------
@@ -54,7 +55,7 @@ class Session:
     def __init__(
         self, annotation: Annotation, jobs: int, save: Callable[[], object], write: Callable[[], object]
     ) -> None:
-        self.annotation, self._jobs, self._save, self._write = annotation, jobs, save, write
+        self.annotation, self._jobs, self._save, self.write = annotation, jobs, save, write
         self.revision, self.decoded = 0, False
         self.tracks: dict[str, ObjectTracks] = {}
         self.next_frames: list[NextFrame] = []
@@ -66,11 +67,11 @@ class Session:
         self._missing: list[Task] = []
         self._running: dict[Future[Any], tuple[Task, Path]] = {}  # with the file that counts its frames
         self._wakes, self._closed, self._is_damaged = True, False, False
-        self._thread = threading.Thread(target=self._run, name="session", daemon=True)
         annotation.progress = self._check_closed
         annotation.frames.is_threaded = True  # for the pictures of the page
 
     def __enter__(self) -> Self:
+        self._thread = threading.Thread(target=self._run, name="session", daemon=True)
         self._thread.start()
         return self
 
@@ -78,6 +79,9 @@ class Session:
         self._closed = True
         self._wake()
         self._thread.join()
+        self.annotation.stop()
+        self._running.clear()
+        self._closed, self._wakes = False, True
 
     @property
     def can_undo(self) -> bool:
@@ -139,7 +143,7 @@ class Session:
         with self.lock:
             if not self.decoded:
                 raise VideoError("the video is not read yet: wait, or press Ctrl-C where the command runs")
-            self._write()
+            self.write()
             self.finished.set()
 
     def remaining(self) -> int:
@@ -251,6 +255,64 @@ class Session:
             for task in self._missing
             if not (task.use_memory and _is_long(task))  # a person need not wait for it to add a box
         )
+
+
+class Sessions:
+    """Sessions of several videos, of which one is open: its passes run. Use it in a `with`.
+
+    The others keep their boxes, finished passes and changes to undo.
+
+    Parameters
+    ----------
+    names : names of the videos
+    start : function that returns the session of a video by its number; VideoError if it cannot be read
+    shares : share of checked frames of each video so far, from 0 to 1
+
+    Attributes
+    ----------
+    names, shares : as of the parameters
+    number : number of the open video
+    """
+
+    def __init__(self, names: Sequence[str], start: Callable[[int], Session], shares: Sequence[float]) -> None:
+        self.names, self.shares, self.number = names, [*shares], 0
+        self._start, self._lock = start, threading.Lock()
+        self._sessions: dict[int, Session] = {}
+
+    def __enter__(self) -> Self:
+        self._sessions[0] = self._start(0).__enter__()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.current.__exit__()
+        for session in self._sessions.values():
+            session.annotation.close()
+
+    def __iter__(self) -> Iterator[Session]:
+        """The sessions of the videos that were opened, in their order."""
+        return (self._sessions[number] for number in sorted(self._sessions))
+
+    @property
+    def current(self) -> Session:
+        """The session of the open video."""
+        return self._sessions[self.number]
+
+    def open(self, number: int) -> None:
+        """Open another video, and write the results of the one that was open. VideoError if one of them fails."""
+        with self._lock:
+            before = self.current
+            if number == self.number or before.finished.is_set():
+                return
+            session = self._sessions.get(number) or self._start(number)
+            before.__exit__()
+            try:
+                if before.decoded and (before.annotation.keyframes or before.can_undo):
+                    self.shares[self.number] = before.annotation.share_checked
+                    before.write()
+            finally:
+                session.revision += before.revision + 1  # it never decreases for the page
+                self._sessions[number] = session.__enter__()
+                self.number = number
 
 
 def _is_long(task: Task) -> bool:

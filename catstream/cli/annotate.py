@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,22 +13,24 @@ from rich.progress import Progress
 from catstream.base.files import locked_folder
 from catstream.base.settings import Settings
 from catstream.base.tables import write_table
-from catstream.base.text import counted
+from catstream.base.text import counted, listed
 from catstream.base.threads import cores
 from catstream.cli.common import INTERRUPTS, line_of, messages, stopped
 from catstream.cli.options import FOLDER, PATH, with_overrides, with_overwrite, with_reading
 from catstream.cli.view import HostPort, server_of, with_listen
 from catstream.errors import VideoError
 from catstream.jobs.job import Results
+from catstream.video.images import IMAGES, natural_order, visible
+from catstream.video.source import VIDEOS, open_source
 
 if TYPE_CHECKING:
     from catstream.annotation.annotation import Annotation
-    from catstream.annotation.session import Session
+    from catstream.annotation.session import Sessions
     from catstream.sinks.track_log import RunFiles
 
 
 @click.command()
-@click.argument("video")
+@click.argument("videos", nargs=-1, required=True, metavar="VIDEO...")
 @click.option(
     "--box",
     "texts",
@@ -36,7 +39,11 @@ if TYPE_CHECKING:
     help="A box at a keyframe, in pixels; may be repeated.",
 )
 @click.option("--boxes", "csv_file", type=PATH, help="CSV file of boxes: frame,object,x,y,w,h.")
-@click.option("--output", type=FOLDER, help="Folder for the results; by default, NAME-annotation.")
+@click.option(
+    "--output",
+    type=FOLDER,
+    help="Folder for the results; by default, NAME-annotation. Of several videos, that is inside of it.",
+)
 @click.option("--jobs", type=click.IntRange(min=1), help="Number of processes; by default, one for each core.")
 @with_listen
 @with_overwrite
@@ -44,7 +51,7 @@ if TYPE_CHECKING:
 @with_reading
 def annotate(
     overrides: dict[str, object],
-    video: str,
+    videos: tuple[str, ...],
     texts: tuple[str, ...],
     csv_file: Path | None,
     output: Path | None,
@@ -54,10 +61,11 @@ def annotate(
 ) -> None:
     """Track objects between boxes at keyframes, and say which frames are right.
 
-    VIDEO is a file or a folder of images. Without boxes, the command serves a
-    page on which they are drawn, for users with the token in its link, as
-    catstream view does; each box is saved at once, and the same command
-    continues. Ctrl-C or the button Done ends it.
+    VIDEO is a file, a folder of images, a folder of videos, or a pattern.
+    Without boxes, the command serves a page on which they are drawn, for users
+    with the token in its link, as catstream view does; it lists several videos,
+    with a folder for the results of each. Each box is saved at once, and the
+    same command continues. Ctrl-C or the button Done ends it.
 
     With boxes, it tracks and ends. Frames count from 0. A box is absent where
     the object is not in the frame, anna@412=absent, or hidden where too much of
@@ -75,13 +83,15 @@ def annotate(
       NAME.ndjson, NAME.csv  the log of the tracks, for catstream export, with
                              checked (keyframe, hidden, checked or unchecked)
                              and probability; unchecked boxes are doubtful
-      keyframes.csv          all boxes: frame,object,x,y,w,h
+      keyframes.csv          all boxes: frame,object,x,y,w,h,file; catstream
+                             batch reads it as well
       next.csv               frames to look at, those with most expected errors
                              first: frame,object,errors
 
     \b
     EXAMPLES
       catstream annotate walk.mp4
+      catstream annotate monday/*.mp4 tuesday --output out
       catstream annotate walk.mp4 --box anna@0=120,80,64,48 --output out
       catstream annotate walk.mp4 --boxes out/keyframes.csv --box anna@412=300,90,60,50 --output out --overwrite
     """
@@ -90,28 +100,120 @@ def annotate(
         from catstream.annotation.keyframes import by_object, parse_keyframe, read_keyframes
 
     drawn = by_object([*([] if csv_file is None else read_keyframes(csv_file)), *map(parse_keyframe, texts)])
-    jobs = jobs or cores()
+    jobs, settings = jobs or cores(), Settings.from_values(overrides)
+    if not drawn:
+        _serve(_listed(videos), output, settings, jobs, listen, overwrite=overwrite)
+        return
+    if len(videos) > 1:
+        raise click.UsageError("boxes are of one video: pass one, or draw them on the page, without --box and --boxes")
     bar = line_of(messages())
-    settings = Settings.from_values(overrides)
     with Annotation(
-        video, drawn, settings, jobs=jobs if drawn else 2 * jobs, progress=lambda *done: show_progress(bar, *done)
+        videos[0], drawn, settings, jobs=jobs, progress=lambda *done: show_progress(bar, *done)
     ) as annotation:
-        results = _ResultFiles(annotation, video, output or Path(f"{annotation.frames.name}-annotation"))
-        if drawn:
-            results.check(overwrite=overwrite)
-            interrupted = _track(annotation, results, bar)
-        else:
-            continues = results.keyframes.exists()
-            results.check(overwrite=overwrite or continues)
-            if continues:
-                annotation.set_boxes(by_object(read_keyframes(results.keyframes)))
-            interrupted = _serve(annotation, jobs, results, listen)
+        results = _ResultFiles(annotation, videos[0], output or Path(f"{annotation.frames.name}-annotation"))
+        results.check(overwrite=overwrite)
+        interrupted = _track(annotation, results, bar)
     _report(annotation)
-    if interrupted and not annotation.keyframes:
-        stopped()
     click.echo(f"results: {results.folder}")
     if interrupted:
         stopped(f"the results so far are in {results.folder}")
+
+
+def _listed(words: Iterable[str]) -> list[str]:
+    """The videos of paths and patterns. A folder without images stands for the videos, and folders of them, in it."""
+
+    def holds(folder: Path, kinds: set[str]) -> bool:
+        return any(each.is_dir() and visible(each, kinds) for each in (folder, folder / "img"))
+
+    videos: list[str] = []
+    for word in words:
+        path = Path(word)
+        inside: list[Path] = []
+        if path.is_dir() and not holds(path, IMAGES):
+            inside = [each for each in path.iterdir() if holds(each, IMAGES | VIDEOS) or each.suffix.lower() in VIDEOS]
+        elif not path.exists() and set("*?[") & set(path.name):
+            inside = [each for each in path.parent.glob(path.name) if each.suffix.lower() not in IMAGES]
+        inside = [each for each in inside if each.name[0] != "."]
+        videos += [*map(str, sorted(inside, key=natural_order))] or [word]
+    return videos
+
+
+def _serve(
+    videos: list[str], output: Path | None, settings: Settings, jobs: int, listen: HostPort, *, overwrite: bool
+) -> None:
+    """Serve the page of some videos until it is done or interrupted, and write the results."""
+    from catstream.annotation.annotation import Annotation
+    from catstream.annotation.keyframes import by_object, read_keyframes
+    from catstream.annotation.session import Session, Sessions
+
+    # Step 1: Name the videos that can be read, and their folders.
+    names: dict[str, str] = {}
+    for video in videos:
+        try:
+            with open_source(video, settings=settings.run) as source:
+                names[video] = source.name
+        except VideoError as error:
+            if len(videos) == 1:
+                raise
+            click.echo(f"skipped: {error}", err=True)
+    if not names:
+        raise VideoError("none of the videos can be read")
+    videos, several = [*names], len(names) > 1
+    labels = [
+        name if [*names.values()].count(name) == 1 else f"{Path(video).absolute().parent.name}_{name}"
+        for video, name in names.items()
+    ]
+    if twice := sorted({label for label in labels if labels.count(label) > 1}):
+        raise VideoError(f"several videos would have the results {listed(twice)}: rename their files")
+    folders = [(output or Path()) / f"{label}-annotation" for label in labels]
+    if output and not several:
+        folders = [output]
+
+    # Step 2: Each video is opened when the page first shows it, and continues with its saved boxes.
+    context, results = click.get_current_context(), dict[int, _ResultFiles]()
+
+    def start(number: int) -> Session:
+        annotation = Annotation(videos[number], {}, settings, jobs=2 * jobs)
+        try:
+            files = _ResultFiles(annotation, videos[number], folders[number])
+            continues = files.keyframes.exists()
+            files.check(overwrite=overwrite or continues)
+            if continues:
+                annotation.set_boxes(by_object(read_keyframes(files.keyframes)))
+            files.begin(context)
+        except BaseException:
+            annotation.close()
+            raise
+        results[number] = files
+        return Session(annotation, jobs, files.save, files.write)
+
+    shares = [_share(folder / f"{name}.csv") for folder, name in zip(folders, names.values(), strict=True)]
+    with Sessions(labels, start, shares) as sessions:
+        interrupted = serve(sessions, listen)
+        session = sessions.current
+        if interrupted and session.decoded:
+            with INTERRUPTS.deferred():
+                session.write()
+
+    # Step 3: Report each of them.
+    for number, session in enumerate(sessions):
+        if several:
+            click.echo(f"{session.annotation.frames.name}:")
+        _report(session.annotation)
+        if not interrupted or session.annotation.keyframes:
+            click.echo(f"results: {sorted(results.items())[number][1].folder}")
+    for session in sessions:
+        if session.problem is not None:
+            raise session.problem
+    if interrupted:
+        drawn = any(session.annotation.keyframes for session in sessions)
+        stopped("the results so far are saved; the same command continues" if drawn else "")
+
+
+def _share(log: Path) -> float:
+    """The share of checked frames in the log of an earlier command, from 0 to 1; 0 without one."""
+    text = log.read_bytes() if log.exists() else b""
+    return 1 - text.count(b",unchecked,") / (text.count(b"\n") - 1) if text.count(b"\n") > 1 else 0.0
 
 
 def _track(annotation: Annotation, results: _ResultFiles, bar: Progress) -> bool:
@@ -120,7 +222,7 @@ def _track(annotation: Annotation, results: _ResultFiles, bar: Progress) -> bool
     with bar:
         bar.add_task("reading", total=None)
         annotation.scan()
-        results.begin()
+        results.begin(click.get_current_context())
         try:
             annotation.track()
         except KeyboardInterrupt:
@@ -130,33 +232,18 @@ def _track(annotation: Annotation, results: _ResultFiles, bar: Progress) -> bool
     return interrupted
 
 
-def _serve(annotation: Annotation, jobs: int, results: _ResultFiles, listen: HostPort) -> bool:
-    """Serve the page until it is done or interrupted, and write the results; return whether it was interrupted."""
-    from catstream.annotation.session import Session
-
-    with Session(annotation, jobs, results.save, results.write) as session:
-        results.begin()
-        interrupted = serve(session, listen)
-    if interrupted and session.decoded and annotation.keyframes:
-        with INTERRUPTS.deferred():
-            results.write()
-    if session.problem is not None:
-        raise session.problem
-    return interrupted
-
-
-def serve(session: Session, listen: HostPort) -> bool:
-    """Serve the page of a session until it is done or interrupted; return whether it was interrupted."""
+def serve(sessions: Sessions, listen: HostPort) -> bool:
+    """Serve the page of sessions until it is done or interrupted; return whether it was interrupted."""
     from catstream.web.annotator import AnnotationSite
 
-    server = server_of(AnnotationSite(session), listen)
+    server = server_of(AnnotationSite(sessions), listen)
     with server.in_background():
         for url in server.urls:
             click.echo(url)
         with suppress(KeyboardInterrupt):
-            while not session.finished.wait(0.5):
+            while not sessions.current.finished.wait(0.5):
                 pass  # without a limit, a signal that arrives just before it waits is handled after it only
-    return not session.finished.is_set()
+    return not sessions.current.finished.is_set()
 
 
 def show_progress(bar: Progress, work: str, done: int, total: int | None) -> None:
@@ -181,15 +268,15 @@ class _ResultFiles:
                 raise VideoError(f"{table} exists already: pass --overwrite, or another --output")
         self._log().check(overwrite=overwrite, earlier=[])
 
-    def begin(self) -> None:
+    def begin(self, context: click.Context) -> None:
         """Lock the folder until the command ends, and save the keyframes; VideoError if another process locked it."""
-        click.get_current_context().with_resource(locked_folder(self.folder, VideoError))
+        context.with_resource(locked_folder(self.folder, VideoError))
         self.save()
 
     def save(self) -> None:
         from catstream.annotation.keyframes import write_keyframes
 
-        write_keyframes(self.keyframes, self._annotation.keyframes)
+        write_keyframes(self.keyframes, self._annotation.keyframes, self._video)
 
     def write(self) -> None:
         """Write the log, and the table of the frames to look at next."""

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Iterable
-from contextlib import ExitStack, closing
+from contextlib import closing
 from datetime import timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -16,11 +15,9 @@ from catstream.base.files import locked_folder
 from catstream.base.settings import Settings
 from catstream.base.text import counted
 from catstream.base.threads import cores
-from catstream.cli.annotate import serve, show_progress
 from catstream.cli.common import INTERRUPTS, line_of, messages, screen, stopped, table
 from catstream.cli.options import FOLDER, PATH, with_overrides, with_overwrite, with_reading
-from catstream.cli.view import HostPort, with_listen
-from catstream.errors import BoxError, CatstreamError, VideoError
+from catstream.errors import CatstreamError, VideoError
 
 _NUMBERS = ("objects", "frames", "present", "doubtful", "checked")
 
@@ -29,21 +26,17 @@ if TYPE_CHECKING:
 
 
 @click.command()
-@click.argument("files", nargs=-1, type=PATH, metavar="BOXES|VIDEO...")
-@click.option("--ask", is_flag=True, help="Draw the boxes in the first frame of each VIDEO, on a page.")
+@click.argument("boxes", type=PATH)
 @click.option("--output", type=FOLDER, required=True, help="Folder for the results.")
 @click.option("--jobs", type=click.IntRange(min=1), help="Videos at a time; by default, the number of cores.")
-@with_listen
 @with_overwrite
 @with_overrides
 @with_reading
 def batch(
     overrides: dict[str, object],
-    files: tuple[Path, ...],
-    ask: bool,
+    boxes: Path,
     output: Path,
     jobs: int | None,
-    listen: HostPort,
     overwrite: bool,
 ) -> None:
     """Track objects in many videos.
@@ -52,10 +45,6 @@ def batch(
     frame, which counts from 0. Paths are relative to its folder. Each object is
     tracked from its box to the end of the video. If it has boxes in several
     frames, it is tracked between them and checked, as by catstream annotate.
-
-    With --ask, the command first serves a page on which boxes are drawn in the
-    first frame of each VIDEO, with a token as for catstream view. Each box
-    is saved at once in boxes.csv, and the button Done begins to track.
 
     A video that fails does not stop the others; the exit status is then 1. The
     same command continues after Ctrl-C, and tracks only videos that failed, are
@@ -66,21 +55,17 @@ def batch(
       NAME.ndjson, NAME.csv  the log of each video
       batch.csv              a row for each video: its tracks, how many of them
                              are present, doubtful and checked, and its error
-      boxes.csv              with --ask: the boxes, for catstream batch
 
     \b
     EXAMPLES
       catstream batch boxes.csv --output out
-      catstream batch --ask monday/*.mp4 --output out
+      catstream batch walk-annotation/keyframes.csv --output out
       catstream export out dataset --format yolo
     """
     with INTERRUPTS.leaving():
         from catstream.batch import Batch, check_results, read_videos
 
-    if not files or (len(files) > 1 and not ask):
-        raise click.UsageError("expected one file BOXES, or videos after --ask")
     settings = Settings.from_values(overrides)
-    boxes = _draw_boxes(files, output, settings, listen, overwrite=overwrite) if ask else files[0]
     videos = read_videos(boxes)
     if not videos:
         raise VideoError(f"{boxes} has no box: add a row for each object")
@@ -112,44 +97,6 @@ def batch(
         raise CatstreamError(
             f"{failed} of {counted(len(videos), 'video')} failed: the results of the others are complete"
         )
-
-
-def _draw_boxes(
-    videos: tuple[Path, ...], output: Path, settings: Settings, listen: HostPort, *, overwrite: bool
-) -> Path:
-    """Serve the page on which boxes are drawn in first frames until it is done; return the table of boxes."""
-    from catstream.annotation.first_frames import FirstFrames
-    from catstream.annotation.session import Session
-    from catstream.batch import check_results, read_boxes, videos_of, write_boxes
-
-    table = output / "boxes.csv"
-    boxes = read_boxes(table) if table.exists() else {}
-    for video in videos:
-        path = video.parent.resolve() / video.name  # the folders may be symbolic links, the video keeps its name
-        boxes.setdefault(os.path.relpath(path, output.resolve()), [])
-    named = videos_of(table, boxes)  # errors that are better reported before any box is drawn
-    if not overwrite:
-        check_results(named, output)
-
-    with ExitStack() as stack:
-        stack.enter_context(locked_folder(output, VideoError))  # which makes it
-        with line_of(messages()) as bar:
-            bar.add_task("opening")
-            frames = FirstFrames(output, boxes, settings, lambda *done: show_progress(bar, *done))
-            stack.enter_context(frames)
-        for error in frames.errors:
-            click.echo(f"skipped: {error}", err=True)
-        if not frames.videos:
-            raise VideoError("none of the videos can be read")
-
-        def check() -> None:
-            if not frames.keyframes:
-                raise BoxError("no box is drawn: draw one, or press Ctrl-C where the command runs")
-
-        session = stack.enter_context(Session(frames, 1, lambda: write_boxes(table, frames.boxes), check))
-        if serve(session, listen):
-            stopped(f"the boxes so far are saved in {table}; the same command continues")
-    return table
 
 
 def _print(summaries: Iterable[Summary]) -> None:

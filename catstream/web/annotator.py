@@ -1,9 +1,9 @@
-"""The web application of `catstream annotate`: a page that shows a session, and changes its boxes.
+"""The web application of `catstream annotate`: a page that shows the session of a video, and changes its boxes.
 
 /                the page
 /events          the state of the session, and what changes in it, as server-sent events, at most ten per second
 /frames/N.jpg    the picture of a frame, scaled down if it is large; /frames/N.jpg?full has all pixels
-/frames/N        its size, and what the passes say about the objects in it
+/frames/N        its size, and what the passes say about the objects in it; both have ?video=N, by default 0
 /edit            POST a change: the fields of `Edit`
 """
 
@@ -25,7 +25,7 @@ from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 
 from catstream.annotation.keyframes import HIDDEN
-from catstream.annotation.session import Session
+from catstream.annotation.session import Session, Sessions
 from catstream.base.arrays import Bool
 from catstream.base.box import Box
 from catstream.base.names import check_name
@@ -39,10 +39,10 @@ _SIDE = 1920  #: longest side of a picture in pixels; a larger frame is scaled d
 
 
 class AnnotationSite:
-    """The web application of a session, `app`, without access control; `Server` serves it."""
+    """The web application of the open one of several sessions, `app`, without access control; `Server` serves it."""
 
-    def __init__(self, session: Session) -> None:
-        self._session, self._closed = session, False
+    def __init__(self, sessions: Sessions) -> None:
+        self._sessions, self._closed = sessions, False
         self._objects_state: tuple[int, int] | None = None  # of which `_objects` are
         self._objects: list[dict[str, object]] = []
         self._id = token_hex(8)  # a tab of an earlier server at the same port has another one
@@ -55,6 +55,10 @@ class AnnotationSite:
             Mount("/page", StaticFiles(directory=PAGE)),
         ]
         self.app = Starlette(routes=routes, exception_handlers={CatstreamError: failed})
+
+    @property
+    def _session(self) -> Session:
+        return self._sessions.current
 
     def close(self) -> None:
         """End the events of all open pages; called before the shutdown of a server, which waits for them."""
@@ -84,6 +88,8 @@ class AnnotationSite:
 
     def _number(self, request: Request) -> int:
         number: int = request.path_params["number"]
+        if request.query_params.get("video", "0") != str(self._sessions.number):
+            raise HTTPException(404, "another video is open\n")
         if number >= len(self._session.annotation.frames):
             raise HTTPException(404, f"frame {number} is not in the video, or not read yet\n")
         return number
@@ -96,9 +102,13 @@ class AnnotationSite:
         return JSONResponse({"done": True, "revision": self._session.revision, **more})
 
     def _change(self, edit: Edit) -> dict[str, object]:
-        if edit.verb == "undo":
+        if edit.verb == "open" and 0 <= edit.video < len(self._sessions.names):
+            self._sessions.open(edit.video)
+        elif edit.video != self._sessions.number:
+            raise CommandRejectedError("another video is open")
+        elif edit.verb == "undo":
             return dict(zip(("object", "frame"), self._session.undo() or (), strict=False))
-        if edit.verb == "rename":
+        elif edit.verb == "rename":
             self._session.rename(edit.object, edit.name)
         elif edit.verb == "delete":
             self._session.delete(edit.object, edit.frame)
@@ -127,8 +137,8 @@ class AnnotationSite:
                 self._objects_state, self._objects = state, self._described()
         return {
             "server": self._id,
-            "video": frames.name,
-            "videos": session.annotation.videos,
+            "video": self._sessions.number,
+            "videos": [*zip(self._sessions.names, self._sessions.shares, strict=True)],
             "frames": len(frames),
             "decoded": session.decoded,
             "objects": self._objects,
@@ -163,6 +173,7 @@ class Edit:
     """A change of the page.
 
     server  id of the server, from the state of the page
+    video   number of the video, which is open; or "open" opens it
     verb    "draw" a box at a frame, none if the object is absent; "delete" it; "undo" the last change; "rename" an
             object; "done"
     object  name of the object
@@ -172,7 +183,8 @@ class Edit:
     """
 
     server: str
-    verb: Literal["draw", "delete", "undo", "rename", "done"]
+    verb: Literal["draw", "delete", "undo", "rename", "open", "done"]
+    video: int = 0
     object: str = ""
     frame: int | None = None
     box: tuple[float, float, float, float] | None = None

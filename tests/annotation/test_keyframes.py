@@ -10,9 +10,12 @@ DRAWN = {"anna": {0: Box(1.5, 2, 30, 40), 412: None, 413: "hidden"}, "": {7: Box
 
 
 def test_a_file_of_keyframes_is_read_as_it_was_written(tmp_path):
-    write_keyframes(tmp_path / "keyframes.csv", DRAWN)
+    write_keyframes(tmp_path / "keyframes.csv", DRAWN, str(tmp_path.parent / "a.mp4"))
     assert by_object(read_keyframes(tmp_path / "keyframes.csv")) == DRAWN
-    assert (tmp_path / "keyframes.csv").read_text().splitlines()[3:] == ["412,anna,absent,,,", "413,anna,hidden,,,"]
+    assert (tmp_path / "keyframes.csv").read_text().splitlines()[3:] == [
+        "412,anna,absent,,,,../a.mp4",
+        "413,anna,hidden,,,,../a.mp4",
+    ]
     texts = [format_keyframe(name, frame, box) for name, boxes in DRAWN.items() for frame, box in boxes.items()]
     assert by_object(map(parse_keyframe, texts)) == DRAWN
 

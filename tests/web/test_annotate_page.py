@@ -34,3 +34,36 @@ def test_a_video_is_annotated_by_mouse_and_keys(script_of_browser, catstream, de
     assert {*drawn} == {("anna", 0), ("anna", FRAMES - 1), ("carl", 0), ("carl", FRAMES - 1)}
     assert float(drawn["anna", 0]) == pytest.approx(truth[0].x, abs=1)
     assert (out / "demo.csv").read_text().count(",carl,") == FRAMES
+
+
+def test_several_videos_are_annotated_one_after_the_other(script_of_browser, catstream, said, demo_video, tmp_path):
+    video, truth = demo_video(FRAMES)
+    (tmp_path / "monday").mkdir()
+    for name in ("monday/walk.mp4", "monday/run10.mp4", "monday/run9.mp4", "walk.mp4"):
+        (tmp_path / name).write_bytes(video.read_bytes())
+    (tmp_path / "monday" / "broken.mp4").write_bytes(video.read_bytes()[:1000])
+    out = tmp_path / "out"
+    words = ["annotate", tmp_path / "monday", tmp_path / "walk.mp4", "--output", out, "--listen", "0"]
+    process = catstream(*words, env=os.environ | {"PYTHONUNBUFFERED": "1"})
+    link = process.stdout.readline().strip()
+    run = subprocess.run(
+        script_of_browser("videos.mjs", link, *map(str, SIZE), json.dumps(truth[0])),
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert run.returncode == 0, run.stdout + run.stderr
+    assert run.stdout.splitlines() == [
+        "first run9, 1 of 4",
+        f"videos run9,run10,monday_walk,{tmp_path.name}_walk 1",
+        "errors []",
+    ]
+    _, errors = process.communicate(timeout=150)
+    assert process.returncode == 0, errors
+    assert "broken.mp4' is not a video that can be read" in errors
+    logs = {log.parent.name: log.read_text() for log in out.glob("*/*.csv") if log.stem.startswith("run")}
+    assert logs["run9-annotation"].count(",anna,") == logs["run10-annotation"].count(",ben,") == FRAMES
+
+    code, *_ = said("batch", out / "run9-annotation" / "keyframes.csv", "--output", tmp_path / "again", "--jobs", 1)
+    assert code == 0
+    assert (tmp_path / "again" / "monday_run9.csv").read_text().count(",anna,") == FRAMES

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from catstream.annotation.annotation import Annotation
-from catstream.annotation.session import Session
+from catstream.annotation.session import Session, Sessions
 from catstream.web import annotator as module
 from catstream.web.annotator import AnnotationSite
 
@@ -23,15 +23,26 @@ def demo(demo_video):
 
 
 @pytest.fixture
-def session(demo, until):
-    with Annotation(demo[0], {}, jobs=2) as annotation, Session(annotation, 1, lambda: None, lambda: None) as one:
-        until(lambda: one.decoded)
-        yield one
+def sessions(demo, until):
+    """Two videos, which are the same; the first one is open."""
+    videos = Sessions(
+        ["walk", "run"],
+        lambda _: Session(Annotation(demo[0], {}, jobs=2), 1, lambda: None, lambda: None),
+        [0.0, 0.5],
+    )
+    with videos:
+        until(lambda: videos.current.decoded)
+        yield videos
 
 
 @pytest.fixture
-def page(session, serve_site):
-    return serve_site(AnnotationSite(session))
+def session(sessions):
+    return sessions.current
+
+
+@pytest.fixture
+def page(sessions, serve_site):
+    return serve_site(AnnotationSite(sessions))
 
 
 @pytest.fixture
@@ -108,8 +119,26 @@ def test_page_of_another_origin_changes_nothing(page, session):
     assert session.annotation.keyframes == {}
 
 
-def test_tab_of_an_earlier_server_changes_nothing(session, serve_site, demo):
-    earlier, page = serve_site(AnnotationSite(session)), serve_site(AnnotationSite(session))
+def test_only_the_open_video_is_shown_and_changed(page, edit, sessions, demo, until):
+    box = [*demo[1][0]]
+    edit("draw", object="anna", frame=0, box=box)
+    until(lambda: sessions.current.annotation.passes("anna"))
+    passes, revision = sessions.current.annotation.passes("anna"), state(page)["revision"]
+    assert edit("open", video=1) == (200, {"done": True})
+    assert edit("draw", object="ben", frame=0, box=box)[0] == 409
+    assert page.get("/frames/0").status_code == 404
+    until(lambda: page.get("/frames/0.jpg?video=1").status_code == 200)
+    now = state(page)
+    assert (now["video"], now["videos"], now["objects"]) == (1, [["walk", pytest.approx(1 / FRAMES)], ["run", 0.5]], [])
+    assert now["revision"] > revision
+    assert edit("draw", object="ben", frame=0, box=box, video=1)[0] == 200
+    edit("open", video=0)
+    assert sessions.current.annotation.passes("anna") == passes
+    assert edit("undo") == (200, {"done": True, "object": "anna", "frame": 0})
+
+
+def test_tab_of_an_earlier_server_changes_nothing(session, sessions, serve_site, demo):
+    earlier, page = serve_site(AnnotationSite(sessions)), serve_site(AnnotationSite(sessions))
     fields = {"server": state(earlier)["server"], "verb": "draw", "object": "anna", "frame": 0, "box": [*demo[1][0]]}
     answer = page.post("/edit", json=fields)
     assert (answer.status_code, answer.json()["reason"]) == (409, "this page belongs to an earlier command: reload it")

@@ -1,5 +1,5 @@
 // The page of `catstream annotate`: a frame, the timelines of the objects, and changes of boxes, which are sent at once.
-// That of `catstream batch --ask` is the same, with the first frame of each video, and nothing to check.
+// Of several videos, one is open.
 
 import { $, add, Items, make, many, post, write } from "./dom.js";
 import { FrameStage } from "./frame.js";
@@ -8,7 +8,7 @@ const JUMP = 25; // frames of a page key
 const WAYS = { "1 forwards": "#74c0fc", "2 backwards": "#f783ac" }; // names and colours of the proposals; no object has a blank in its name
 const CHECKS = { keyframe: "your box", hidden: "hidden, estimated", checked: "checked", unchecked: "may be wrong" };
 const KEYS = { n: "next", enter: "next", b: "back", u: "undo", 1: "first", 2: "second", d: "draw", a: "absent", o: "new",
-  delete: "delete", backspace: "delete", "+": "closer", "=": "closer", "-": "farther", 0: "whole", "?": "help" };
+  v: "video", delete: "delete", backspace: "delete", "+": "closer", "=": "closer", "-": "farther", 0: "whole", "?": "help" };
 
 /** The name of a key in `KEYS`: by its label, else by its place, as on a keyboard with other letters. */
 function nameOf({ key, code }) {
@@ -18,14 +18,15 @@ function nameOf({ key, code }) {
 
 class AnnotatePage {
   constructor() {
-    Object.assign(this, { state: null, frame: 0, chosen: null, boxes: {}, visited: [], edits: [], sent: Promise.resolve(), silent: false, ended: "" });
+    Object.assign(this, { state: null, frame: 0, chosen: null, boxes: {}, visited: [], places: {}, edits: [], sent: Promise.resolve(), silent: false, ended: "" });
     this.stage = new FrameStage($("#stage"), this, { hold: () => ({ frame: this.frame }), follow: (box) => this.set(box, this.stage.picture.frame), changed: () => {},
       zoomed: (scale) => write($("#whole span"), `${Math.round(100 * scale)} %`) });
     this.rows = new Items($("#timelines"), { make: (name) => this.makeRow(name), fill: (row, one) => this.fillRow(row, one) });
+    this.videos = new Items($("#list"), { make: (number) => this.makeVideo(Number(number)), fill: (item, one) => this.fillVideo(item, one) });
     const actions = { next: () => this.next(), back: () => this.visited.length && this.go(...this.visited.pop()), undo: () => this.undo(),
       first: () => this.take("1 forwards"), second: () => this.take("2 backwards"), draw: () => this.draw(), absent: () => this.set(null),
       delete: () => this.delete(this.frame), forget: () => this.delete(null), new: () => { this.stage.leave(); this.choose(null); }, help: () => $("#keys").showModal(),
-      closer: () => this.stage.zoomBy(1.5), farther: () => this.stage.zoomBy(1 / 1.5), whole: () => this.stage.zoomBy(0), done: () => this.done() };
+      closer: () => this.stage.zoomBy(1.5), farther: () => this.stage.zoomBy(1 / 1.5), whole: () => this.stage.zoomBy(0), video: () => this.open(this.other), done: () => this.done() };
     for (const [id, act] of Object.entries(actions)) $(`#${id}`).onclick = act;
     $("#slider").oninput = () => this.go(Number($("#slider").value));
     $("#name").onchange = () => this.rename();
@@ -49,7 +50,8 @@ class AnnotatePage {
     if (!closed) {
       const before = this.state;
       this.state = state;
-      if (!before?.objects.length && state.objects.length && this.chosen === null) this.choose(state.objects[0].name);
+      if (before && state.video !== before.video) this.change(before.video);
+      if (!before && state.objects.length) this.choose(state.objects[0].name);
       if (!this.edits.length && before?.objects.some(({ name }) => name === this.chosen) && !this.get(this.chosen)) this.choose(null, this.chosen);
       if (state.revision !== before?.revision) this.load();
     }
@@ -83,7 +85,7 @@ class AnnotatePage {
   }
 
   /** Go to a frame, and choose an object. */
-  go(frame, name = this.missing(frame)) {
+  go(frame, name = this.chosen) {
     this.stage.leave();
     this.frame = Math.max(0, Math.min((this.state?.frames ?? 1) - 1, frame));
     this.boxes = {}; // the proposals of another frame cannot be taken
@@ -92,11 +94,25 @@ class AnnotatePage {
     this.load();
   }
 
-  /** The object to draw in the first frame of a video: the first one without a box, except the one drawn now. */
-  missing(frame, drawn = null) {
-    const { state, chosen } = this;
-    const missing = state?.videos.length ? state.objects.find(({ name, keyframes }) => name !== drawn && !keyframes.includes(frame)) : null;
-    return missing?.name ?? chosen;
+  /** Show another video, where it was left. */
+  change(before) {
+    const { objects, video } = this.state;
+    this.places[before] = this.frame;
+    Object.assign(this, { boxes: {}, visited: [], frame: this.places[video] ?? 0 });
+    this.stage.clear();
+    this.stage.zoom = 1;
+    this.choose(objects[0]?.name ?? null);
+  }
+
+  /** Save what is being changed, and open another video. */
+  async open(video) {
+    if (video !== undefined && await this.commit()) this.send("open", { video });
+  }
+
+  /** The next video that is not checked, undefined if there is none. */
+  get other() {
+    const { video = 0, videos = [] } = this.state ?? {}, order = [...videos.keys()];
+    return [...order.slice(video + 1), ...order.slice(0, video)].find((number) => videos[number][1] < 1);
   }
 
   jump(frame, name) {
@@ -111,13 +127,13 @@ class AnnotatePage {
     this.loading = true;
     while (this.wanted) {
       this.wanted = false;
-      const { frame } = this;
-      const answer = await fetch(`frames/${frame}`).then((response) => response.ok && response.json(), () => null);
-      if (!answer) continue;
+      const { frame, state: { video } } = this, query = video ? `video=${video}` : "";
+      const answer = await fetch(`frames/${frame}?${query}`).then((response) => response.ok && response.json(), () => null);
+      if (!answer || video !== this.state.video) continue;
       const { size: [width, height], objects } = answer;
       this.boxes = objects;
       const shown = this.stage.picture?.frame === frame;
-      if (!shown) await this.stage.show({ frame, width, height, boxes: {} });
+      if (!shown) await this.stage.show({ frame, query, width, height, boxes: {} });
       this.showBoxes();
       if (!shown && this.stage.picture) this.stage.reveal();
       this.show();
@@ -136,7 +152,7 @@ class AnnotatePage {
   get check() {
     const { box, checked, proposals } = this.boxes[this.chosen] ?? {};
     if (!checked) return "";
-    if (checked === "unchecked" && !proposals.some(Boolean)) return this.state.videos.length ? "no box" : "not tracked yet";
+    if (checked === "unchecked" && !proposals.some(Boolean)) return "not tracked yet";
     return (box ? "" : "absent, ") + CHECKS[checked];
   }
 
@@ -150,12 +166,12 @@ class AnnotatePage {
 
   /** Send a change after the earlier ones; returns the answer once its state is here, null if it is rejected, with the reason shown. */
   send(verb, more = {}) {
-    const edit = { verb, ...more };
+    const edit = { verb, video: this.state.video, ...more };
     this.edits.push(edit);
     this.sent = this.sent.then(async () => {
       const answer = await post("edit", { server: this.state.server, ...edit });
       write($("#message"), answer.reason ?? "");
-      while (answer.done && this.state.revision < answer.revision && !this.silent) await new Promise((resolve) => { this.arrived = resolve; });
+      while (answer.done && verb !== "done" && this.state.revision < answer.revision && !this.silent) await new Promise((resolve) => { this.arrived = resolve; });
       this.edits.shift();
       if (!answer.done) return null;
       if (verb === "rename") {
@@ -201,7 +217,6 @@ class AnnotatePage {
     const answer = await this.send("draw", { object, frame, box: box && box.map((side) => Math.round(side * 10) / 10) });
     if (!answer) this.load();
     if (answer && this.chosen === null && this.typed === object) this.choose(object);
-    if (answer && this.state.videos.length) this.choose(this.missing(frame, this.chosen));
     return answer;
   }
 
@@ -240,7 +255,7 @@ class AnnotatePage {
   }
 
   async done() {
-    if (await this.commit() && await this.send("done")) this.end(`Done: ${this.state.videos.length ? "the command tracks the videos now" : "the results are written, and the command has ended"}. This tab can be closed.`);
+    if (await this.commit() && await this.send("done")) this.end("Done: the results are written, and the command has ended. This tab can be closed.");
   }
 
   /** Show no other state from now on, but the reason. */
@@ -252,14 +267,13 @@ class AnnotatePage {
 
   /** The frames to look at next, but this one. */
   get following() {
-    const { videos, frames } = this.state ?? { videos: [] }, next = this.frame + 1;
-    if (videos.length) return next < frames ? [[next, this.missing(next), 0]] : [];
     return (this.state?.next ?? []).filter(([frame, name]) => frame !== this.frame || name !== this.chosen);
   }
 
   next() {
     const [[frame, name] = []] = this.following;
     if (name !== undefined) this.jump(frame, name);
+    else if (this.isChecked) this.open(this.other);
   }
 
   key(event) {
@@ -279,6 +293,32 @@ class AnnotatePage {
     event.preventDefault();
   }
 
+  /** Whether all frames of the video are checked. */
+  get isChecked() {
+    const { objects, decoded, next, remaining } = this.state;
+    return objects.length > 0 && decoded && !next.length && !remaining;
+  }
+
+  /** The share of checked frames of the open video. */
+  get part() {
+    const { objects, frames } = this.state, wrong = objects.reduce((sum, one) => sum + one.wrong, 0);
+    return objects.length ? 1 - wrong / frames / objects.length : 0;
+  }
+
+  makeVideo(number) {
+    const element = document.createElement("li");
+    const choose = add(element, "button", { type: "button", className: "choose", onclick: () => this.open(number) });
+    const [name, state] = [add(choose, "b"), add(choose, "span", { className: "number" })];
+    return { element, choose, name, state, share: add(add(choose, "span", { className: "share" }), "i") };
+  }
+
+  fillVideo({ choose, name, state, share }, { label, part, open }) {
+    choose.setAttribute("aria-pressed", String(open));
+    write(name, label);
+    write(state, `${Math.floor(100 * part)}% checked`);
+    share.style.width = `${100 * part}%`;
+  }
+
   makeRow(name) {
     const element = document.createElement("li");
     const choose = add(element, "button", { type: "button", onclick: () => { this.stage.leave(); this.choose(name); } });
@@ -293,7 +333,7 @@ class AnnotatePage {
     return { element, choose, line, share: add(element, "span", { className: "share number" }) };
   }
 
-  fillRow({ element, choose, line, share }, { name, colour, keyframes, wrong, unchecked, frames, frame, chosen, several }) {
+  fillRow({ element, choose, line, share }, { name, colour, keyframes, wrong, unchecked, frames, frame, chosen }) {
     element.style.setProperty("--colour", colour);
     choose.setAttribute("aria-pressed", String(chosen));
     const bar = (kind, first, last) => make("rect", { class: kind, x: first, width: last - first + 1, y: 1, height: 3 });
@@ -303,7 +343,7 @@ class AnnotatePage {
       mark("now", frame), ...keyframes.map((place) => mark("", place)));
     const percent = Math.floor(100 * (1 - wrong / frames));
     write(share, `${percent}%`);
-    line.setAttribute("aria-label", `${name}: ${many(keyframes.length, "box", "boxes")}, ${percent} % of the ${several ? "videos" : "frames checked"}`);
+    line.setAttribute("aria-label", `${name}: ${many(keyframes.length, "box", "boxes")}, ${percent} % of the frames checked`);
   }
 
   show() {
@@ -314,35 +354,35 @@ class AnnotatePage {
     write($("#state b"), words);
     write($("#overlay"), this.overlay());
     if (!state) return;
-    const several = state.videos.length > 0, video = several ? state.videos[frame] : state.video, command = `catstream ${several ? "batch" : "annotate"}`;
-    write($("#source"), video);
-    write($("h1"), command);
-    document.title = `${video} – ${command}`;
+    const { videos, video } = state, [name] = videos[video], several = videos.length > 1;
+    write($("#source"), several ? `${name}, ${video + 1} of ${videos.length}` : name);
+    document.title = `${name} – catstream annotate`;
     write($("#problem"), state.problem);
     Object.assign($("#slider"), { max: state.frames - 1, value: frame });
-    write($("#frame"), `${several ? `video ${frame + 1}` : frame} of ${state.frames}`);
+    write($("#frame"), `${frame} of ${state.frames}`);
     $("#naming").style.setProperty("--colour", known?.colour ?? "transparent");
-    write($("#check"), known ? `${chosen || "The object"}${several ? "" : ` in frame ${frame}`}: ${this.check}` : "A new object: draw its box");
-    for (const [id, name] of [["first", "1 forwards"], ["second", "2 backwards"]]) {
-      write($(`#${id} span`), `Take ${name.slice(2)}${name in proposals && !proposals[name] ? ": absent" : ""}`);
-      $(`#${id}`).disabled = !(name in proposals);
+    write($("#check"), known ? `${chosen || "The object"} in frame ${frame}: ${this.check}` : "A new object: draw its box");
+    for (const [id, way] of [["first", "1 forwards"], ["second", "2 backwards"]]) {
+      write($(`#${id} span`), `Take ${way.slice(2)}${way in proposals && !proposals[way] ? ": absent" : ""}`);
+      $(`#${id}`).disabled = !(way in proposals);
     }
-    const [[place, name, errors] = []] = following;
-    const all = objects.length && state.decoded && !state.next.length && !state.remaining;
-    write($("#next span"), several ? (place === undefined ? "No other video: Done begins to track" : "Next video")
-      : place !== undefined ? `Look next at frame ${place}, ${name || "the object"}: about ${many(Math.max(1, Math.round(errors)), "frame")} around it may be wrong`
-      : all ? "All frames are checked" : state.next.length ? "Draw the box here, or take one" : objects.length ? "Tracking" : "Draw the first box");
+    const [[place, object, errors] = []] = following, more = this.isChecked ? this.other : undefined;
+    write($("#next span"), place !== undefined ? `Look next at frame ${place}, ${object || "the object"}: about ${many(Math.max(1, Math.round(errors)), "frame")} around it may be wrong`
+      : this.isChecked ? `All frames are checked${more === undefined ? "" : `: go to ${videos[more][0]}`}`
+      : state.next.length ? "Draw the box here, or take one" : objects.length ? "Tracking" : "Draw the first box");
     const off = silent || ended;
-    $("#next").disabled = off || place === undefined;
-    $("#absent").disabled = off || !known || several;
-    for (const id of ["first", "second", "absent", "legend"]) $(`#${id}`).hidden = several;
+    $("#next").disabled = off || (place === undefined && more === undefined);
+    $("#absent").disabled = off || !known;
     $("#delete").disabled = off || this.boxes[chosen]?.checked !== "keyframe";
     $("#forget").disabled = off || !known;
     $("#undo").disabled = off || !state.undo;
     $("#back").disabled = !this.visited.length;
     for (const id of ["draw", "new", "done", "name"]) $(`#${id}`).disabled = off;
     $("#objects").hidden = !objects.length;
-    this.rows.show(objects.map((one) => [one.name, { ...one, frames: state.frames, frame, chosen: one.name === chosen, several }]));
+    this.rows.show(objects.map((one) => [one.name, { ...one, frames: state.frames, frame, chosen: one.name === chosen }]));
+    $("#videos").hidden = !several;
+    $("#video").disabled = off || this.other === undefined;
+    this.videos.show(videos.map(([label, share], number) => [String(number), { label, part: number === video ? this.part : share, open: number === video }]));
   }
 
   /** What the server does, as a state for its colour and in words. */

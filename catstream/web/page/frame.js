@@ -21,8 +21,8 @@ export class FrameStage extends Stage {
     for (const kind of ["pointerup", "pointercancel"]) addEventListener(kind, lift);
   }
 
-  url({ frame, full }) {
-    return `frames/${frame}.jpg${full ? "?full" : ""}`;
+  url({ frame, query, full }) {
+    return `frames/${frame}.jpg?${query}${full ? "&full" : ""}`.replace(/\?$/, "");
   }
 
   /** Load and show a picture; with all of its pixels, if it is zoomed. */
