@@ -295,7 +295,10 @@ class Sessions:
     @property
     def current(self) -> Session:
         """The session of the open video."""
-        return self._sessions[self.number]
+        return self[self.number]
+
+    def __getitem__(self, number: int) -> Session:
+        return self._sessions[number]
 
     def open(self, number: int) -> None:
         """Open another video, and write the results of the one that was open. VideoError if one of them fails."""

@@ -24,7 +24,7 @@ from starlette.responses import FileResponse, JSONResponse, Response
 from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 
-from catstream.annotation.keyframes import HIDDEN
+from catstream.annotation.keyframes import HIDDEN, KeyframeBox
 from catstream.annotation.session import Session, Sessions
 from catstream.base.arrays import Bool
 from catstream.base.box import Box
@@ -115,7 +115,8 @@ class AnnotationSite:
         elif edit.verb == "done":
             self._session.finish()
         else:
-            self._session.draw(check_name(edit.object), edit.frame or 0, edit.box and Box(*edit.box))
+            box: KeyframeBox = HIDDEN if isinstance(edit.box, str) else edit.box and Box(*edit.box)
+            self._session.draw(check_name(edit.object), edit.frame or 0, box)
         return {}
 
     async def _states(self) -> AsyncIterator[str]:
@@ -130,14 +131,15 @@ class AnnotationSite:
         yield event({"closed": True})
 
     def _state(self) -> dict[str, object]:
-        session, frames = self._session, self._session.annotation.frames
+        number = self._sessions.number
+        session, frames = self._sessions[number], self._sessions[number].annotation.frames
         with session.lock:
             state = (session.revision, len(frames))
             if state != self._objects_state:
-                self._objects_state, self._objects = state, self._described()
+                self._objects_state, self._objects = state, _described(session)
         return {
             "server": self._id,
-            "video": self._sessions.number,
+            "video": number,
             "videos": [*zip(self._sessions.names, self._sessions.shares, strict=True)],
             "frames": len(frames),
             "decoded": session.decoded,
@@ -148,24 +150,6 @@ class AnnotationSite:
             "undo": session.can_undo,
             "problem": str(session.problem or ", ".join(describe_counters(session.annotation.counters))),
         }
-
-    def _described(self) -> list[dict[str, object]]:
-        """The objects with their keyframes, the number of unchecked frames, and where these are."""
-        objects: list[dict[str, object]] = []
-        for name, drawn in self._session.annotation.keyframes.items():
-            unchecked = np.ones(len(self._session.annotation.frames), bool)
-            if name in self._session.tracks:
-                unchecked = self._session.tracks[name].unchecked
-            objects.append(
-                {
-                    "name": name,
-                    "colour": PALETTE[len(objects) % len(PALETTE)],
-                    "keyframes": sorted(drawn),
-                    "wrong": int(unchecked.sum()),
-                    "unchecked": _runs(unchecked),
-                }
-            )
-        return objects
 
 
 @dataclass(frozen=True, slots=True)
@@ -178,7 +162,7 @@ class Edit:
             object; "done"
     object  name of the object
     frame   number of the frame; none deletes the object
-    box     x, y, w, h in pixels
+    box     x, y, w, h in pixels, or "hidden"
     name    the new name
     """
 
@@ -187,8 +171,27 @@ class Edit:
     video: int = 0
     object: str = ""
     frame: int | None = None
-    box: tuple[float, float, float, float] | None = None
+    box: tuple[float, float, float, float] | Literal["hidden"] | None = None
     name: str = ""
+
+
+def _described(session: Session) -> list[dict[str, object]]:
+    """The objects with their keyframes, the number of unchecked frames, and where these are."""
+    objects: list[dict[str, object]] = []
+    for name, drawn in session.annotation.keyframes.items():
+        unchecked = np.ones(len(session.annotation.frames), bool)
+        if name in session.tracks:
+            unchecked = session.tracks[name].unchecked
+        objects.append(
+            {
+                "name": name,
+                "colour": PALETTE[len(objects) % len(PALETTE)],
+                "keyframes": sorted(drawn),
+                "wrong": int(unchecked.sum()),
+                "unchecked": _runs(unchecked),
+            }
+        )
+    return objects
 
 
 def _rounded(box: Box | None) -> list[float] | None:

@@ -57,6 +57,8 @@ await withBrowser(executablePath, profile, async (browser) => {
   await says("#next", "Look next at frame 23, ben");
   await page.click("#next");
   await page.waitForSelector('#picture[src="frames/23.jpg"]', patience);
+  await keys("h");
+  await says("#check", "ben in frame 23: hidden");
   await keys("a");
   await says("#check", "ben in frame 23: absent, your box");
   await draw([220, 170, 60, 60]); // another place: the directions do not agree

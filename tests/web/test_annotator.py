@@ -72,6 +72,9 @@ def test_picture_of_a_frame_is_that_of_the_video(page, session):
 def test_boxes_are_drawn_marked_absent_renamed_and_undone(page, edit, demo):
     truth = [[*box] for box in demo[1]]
     assert edit("draw", object="anna", frame=0, box=truth[0]) == (200, {"done": True})
+    assert edit("draw", object="anna", frame=10, box="hidden") == (200, {"done": True})
+    assert page.get("/frames/10").json()["objects"]["anna"]["checked"] == "hidden"
+    edit("undo")
     assert edit("draw", object="anna", frame=11) == (200, {"done": True})
     assert edit("delete", object="anna") == (200, {"done": True})
     assert state(page)["objects"] == []

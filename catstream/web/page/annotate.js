@@ -6,8 +6,8 @@ import { FrameStage } from "./frame.js";
 
 const JUMP = 25; // frames of a page key
 const WAYS = { "1 forwards": "#74c0fc", "2 backwards": "#f783ac" }; // names and colours of the proposals; no object has a blank in its name
-const CHECKS = { keyframe: "your box", hidden: "hidden, estimated", checked: "checked", unchecked: "may be wrong" };
-const KEYS = { n: "next", enter: "next", b: "back", u: "undo", 1: "first", 2: "second", d: "draw", a: "absent", o: "new",
+const CHECKS = { keyframe: "your box", hidden: "hidden, its box is estimated", checked: "checked", unchecked: "may be wrong" };
+const KEYS = { n: "next", enter: "next", b: "back", u: "undo", 1: "first", 2: "second", d: "draw", a: "absent", h: "hidden", o: "new",
   v: "video", delete: "delete", backspace: "delete", "+": "closer", "=": "closer", "-": "farther", 0: "whole", "?": "help" };
 
 /** The name of a key in `KEYS`: by its label, else by its place, as on a keyboard with other letters. */
@@ -24,7 +24,7 @@ class AnnotatePage {
     this.rows = new Items($("#timelines"), { make: (name) => this.makeRow(name), fill: (row, one) => this.fillRow(row, one) });
     this.videos = new Items($("#list"), { make: (number) => this.makeVideo(Number(number)), fill: (item, one) => this.fillVideo(item, one) });
     const actions = { next: () => this.next(), back: () => this.visited.length && this.go(...this.visited.pop()), undo: () => this.undo(),
-      first: () => this.take("1 forwards"), second: () => this.take("2 backwards"), draw: () => this.draw(), absent: () => this.set(null),
+      first: () => this.take("1 forwards"), second: () => this.take("2 backwards"), draw: () => this.draw(), absent: () => this.set(null), hidden: () => this.set("hidden"),
       delete: () => this.delete(this.frame), forget: () => this.delete(null), new: () => { this.stage.leave(); this.choose(null); }, help: () => $("#keys").showModal(),
       closer: () => this.stage.zoomBy(1.5), farther: () => this.stage.zoomBy(1 / 1.5), whole: () => this.stage.zoomBy(0), video: () => this.open(this.other), done: () => this.done() };
     for (const [id, act] of Object.entries(actions)) $(`#${id}`).onclick = act;
@@ -153,7 +153,7 @@ class AnnotatePage {
     const { box, checked, proposals } = this.boxes[this.chosen] ?? {};
     if (!checked) return "";
     if (checked === "unchecked" && !proposals.some(Boolean)) return "not tracked yet";
-    return (box ? "" : "absent, ") + CHECKS[checked];
+    return (box || checked === "hidden" ? "" : "absent, ") + CHECKS[checked];
   }
 
   showBoxes() {
@@ -206,15 +206,16 @@ class AnnotatePage {
     return !(await Promise.all([this.stage.leave(), this.rename()])).includes(null);
   }
 
-  /** Save the box of the chosen object, or of a new one, in the frame that is shown; null if it is absent. */
+  /** Save the box of the chosen object, or of a new one, in the frame that is shown; null if it is absent, "hidden" if it is covered. */
   async set(box, frame = this.frame) {
     this.stage.cancel();
     const { chosen, typed } = this, object = chosen ?? typed;
     if (!this.shows(frame)) return null;
     if (chosen === null && this.get(object)) return this.refuse(`There is an object ${object} already: use another name`);
-    if (this.get(object)) this.boxes[object] = { box, checked: "keyframe", proposals: [null, null] }; // until the answer
+    const is = box === "hidden" ? { ...this.boxes[object], checked: box } : { box, checked: "keyframe" };
+    if (this.get(object)) this.boxes[object] = { proposals: [null, null], ...is }; // until the answer
     this.showBoxes();
-    const answer = await this.send("draw", { object, frame, box: box && box.map((side) => Math.round(side * 10) / 10) });
+    const answer = await this.send("draw", { object, frame, box: Array.isArray(box) ? box.map((side) => Math.round(side * 10) / 10) : box });
     if (!answer) this.load();
     if (answer && this.chosen === null && this.typed === object) this.choose(object);
     return answer;
@@ -372,8 +373,8 @@ class AnnotatePage {
       : state.next.length ? "Draw the box here, or take one" : objects.length ? "Tracking" : "Draw the first box");
     const off = silent || ended;
     $("#next").disabled = off || (place === undefined && more === undefined);
-    $("#absent").disabled = off || !known;
-    $("#delete").disabled = off || this.boxes[chosen]?.checked !== "keyframe";
+    $("#absent").disabled = $("#hidden").disabled = off || !known;
+    $("#delete").disabled = off || !["keyframe", "hidden"].includes(this.boxes[chosen]?.checked);
     $("#forget").disabled = off || !known;
     $("#undo").disabled = off || !state.undo;
     $("#back").disabled = !this.visited.length;
