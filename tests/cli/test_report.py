@@ -4,11 +4,15 @@ import csv
 import json
 import re
 
+import av
+import numpy as np
 import pytest
 
 from catstream.base.box import Box
+from catstream.errors import VideoError
 from catstream.messages.kinds import Track
 from catstream.sinks.destinations import Head
+from catstream.video.source import open_source
 
 STATES = "PPPPDDAAPP"  # present, doubtful, absent
 
@@ -86,6 +90,23 @@ def test_the_pictures_of_a_report_are_the_middles_of_doubtful_stretches(walk, su
     assert "anna, 3 doubtful frames" in page
     assert page.count("data:image/jpeg") == 1
     assert not errors
+
+
+def test_a_report_has_pictures_of_frames_after_a_damaged_part(rng, succeed, tmp_path):
+    video = tmp_path / "walk.avi"
+    with av.open(str(video), "w") as file:
+        stream = file.add_stream("mpeg4", rate=10, width=64, height=48, pix_fmt="yuv420p")
+        stream.codec_context.gop_size = 4
+        for image in rng.integers(0, 255, (40, 48, 64, 3), np.uint8):
+            file.mux(stream.encode(av.VideoFrame.from_ndarray(image, "bgr24")))
+        file.mux(stream.encode())
+    data = bytearray(video.read_bytes())
+    data[len(data) // 4 : len(data) // 4 + 3000] = bytes(3000)
+    video.write_bytes(data)
+    with open_source(video) as source, pytest.raises(VideoError, match="is damaged at frame"):
+        list(source)
+    succeed("report", write_log(tmp_path / "walk.ndjson", str(video), size=(64, 48), states="P" * 24 + "DDDP"))
+    assert "frame 25, " in (tmp_path / "walk.html").read_text()
 
 
 def test_the_logs_of_a_folder_have_a_section_each_and_names_are_escaped(succeed, tmp_path):
