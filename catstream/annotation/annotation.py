@@ -314,7 +314,7 @@ class Annotation:
                             f"frame {frame} is outside the video: pass a frame from 0 to {len(self.frames) - 1}"
                         )
                     if isinstance(box, Box):
-                        box.validated(*self.frames.size_of(frame))
+                        box.validated(*self.frames.size)
 
     def _stretches(self) -> Iterator[_Stretch]:
         """Yield the stretches of all objects that have a frame."""

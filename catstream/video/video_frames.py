@@ -177,10 +177,6 @@ class VideoFrames:
                 self._reader = _Reader(self, self._source, self._index)
             return self._reader.image(range(len(self._index.packets))[self._part][number])
 
-    def size_of(self, number: int) -> tuple[int, int]:  # noqa: ARG002  # of first frames, each has its own
-        """Width and height of a frame in pixels."""
-        return self.size
-
     def close(self) -> None:
         """Free the decoder and its cache; the next image opens the file again."""
         with self._lock:

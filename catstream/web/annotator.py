@@ -84,7 +84,7 @@ class AnnotationSite:
                     "checked": HIDDEN if answer == HIDDEN else "keyframe" if number in drawn else check,
                     "proposals": [[_rounded(proposals[way])] if way in proposals else None for way in (True, False)],
                 }
-        return JSONResponse({"size": session.annotation.frames.size_of(number), "objects": objects})
+        return JSONResponse({"size": session.annotation.frames.size, "objects": objects})
 
     def _number(self, request: Request) -> int:
         number: int = request.path_params["number"]
