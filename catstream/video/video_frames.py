@@ -152,14 +152,14 @@ class VideoFrames:
         self.times, self.is_exact, self.is_threaded = np.array([first.time]), False, False
         self._first: UInt8 | None = first.image
         self._index: _Index | None = None
-        self._lock = threading.Lock()
+        self._lock = threading.RLock()
         self._reader: _Reader | None = None
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "is_threaded": False, "_lock": None, "_reader": None, "_first": None}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(state, _lock=threading.Lock())
+        self.__dict__.update(state, _lock=threading.RLock())
 
     def __len__(self) -> int:
         return len(self.times)
@@ -180,7 +180,9 @@ class VideoFrames:
     def close(self) -> None:
         """Free the decoder and its cache; the next image opens the file again."""
         with self._lock:
-            self._close_reader()
+            if self._reader is not None:
+                self._reader.close()
+            self._reader = None
 
     def scan(self, progress: Progress = lambda *_: None, *, exact: bool = False) -> None:
         """Number the frames: from the packets if that is certain, else, or if `exact`, by decoding all.
@@ -283,14 +285,9 @@ class VideoFrames:
 
     def _publish(self, index: _Index, counters: dict[str, float], *, exact: bool = False) -> None:
         with self._lock:
-            self._close_reader()
+            self.close()
             self._index, self.is_exact, self.counters = index, exact, counters
             self.times = index.times[self._part]
-
-    def _close_reader(self) -> None:
-        if self._reader is not None:
-            self._reader.close()
-        self._reader = None
 
 
 class _Reader:
