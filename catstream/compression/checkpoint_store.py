@@ -32,7 +32,7 @@ class CheckpointStore:
     removed before, but never the newest valid one.
 
     size           bytes of the newest checkpoint that this store has written
-    write_problem  why the last checkpoint could not be written; empty if it was
+    write_problem  why the last checkpoint could not be written; empty if it was, None before the first one
     trouble        current problems
     """
 
@@ -42,7 +42,7 @@ class CheckpointStore:
         self.size = 0
         self._damaged: list[Path] = []
         self._read_problem = ""  # why checkpoints were not used
-        self.write_problem = ""
+        self.write_problem: str | None = None
 
     @property
     def trouble(self) -> str:

@@ -147,8 +147,8 @@ class CompressorLoop:
             self._forest.check_features(message)
 
     def _counters(self) -> dict[str, float]:
-        failed = float(bool(self._checkpoints.write_problem))
-        return self._forest.counters() | {"stored": self._stored, "write_failed": failed}
+        counters, problem = self._forest.counters() | {"stored": self._stored}, self._checkpoints.write_problem
+        return counters if problem is None else counters | {"write_failed": float(bool(problem))}
 
 
 class SavedModels(Publisher[ModelFile]):

@@ -146,11 +146,12 @@ class Events:
                 self.source_lost = False
                 events["source_back"] = {"seconds": round(self._source_seconds, 1)}
             self._source_seconds = seconds
-        before, problem = self._write_problems.get(process, ""), report.trouble if counters.get("write_failed") else ""
-        self._write_problems[process] = problem
-        if bool(before) != bool(problem):
-            facts = {"frames": int(counters.get("not_written", 0)), "reason": problem or before}
-            events["write_failed" if problem else "write_resumed"] = facts
+        if (failed := counters.get("write_failed")) is not None:  # a restarted process has not tried it yet
+            before, problem = self._write_problems.get(process, ""), report.trouble if failed else ""
+            self._write_problems[process] = problem
+            if bool(before) != bool(problem):
+                facts = {"frames": int(counters.get("not_written", 0)), "reason": problem or before}
+                events["write_failed" if problem else "write_resumed"] = facts
         return self._selected([Event(kind, None, facts={"source": self._source, **events[kind]}) for kind in events])
 
     @property

@@ -86,7 +86,9 @@ def test_results_and_checkpoints_that_cannot_be_written_are_an_event_each_and_so
             Health("detector", 0, {"write_failed": failed, "not_written": 7.0}, "full", "cam")
             for failed in (0, 1, 1, 0)
         ),
-        *(Health("compressor", 0, {"write_failed": failed}, "read-only" * failed) for failed in (0, 1, 0, 0)),
+        Health("compressor", 0, {"write_failed": 1}, "read-only"),
+        Health("compressor", 0, {}),  # restarted: it has not tried it yet
+        *(Health("compressor", 0, {"write_failed": failed}, "read-only" * failed) for failed in (1, 0, 0)),
     ]
     found = [event for report in reports for event in events.update_run(report)]
     assert [(event.kind, *event.facts.values()) for event in found] == [
