@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import logging
 import math
 from contextlib import AbstractContextManager
 from dataclasses import replace
 from time import monotonic
 
+from catstream.base.files import writing
 from catstream.detection.objects import Detectors
-from catstream.errors import CatstreamError, ProtocolError
+from catstream.errors import CatstreamError, ProtocolError, ServiceError
 from catstream.jobs.job import Job
 from catstream.jobs.saved_model import SavedModel
 from catstream.jobs.state import SEARCHED
@@ -21,7 +21,7 @@ from catstream.processes.process import Process
 from catstream.wire.channels import CONTROL
 from catstream.wire.commands import Responder
 
-_log = logging.getLogger(__name__)
+_RETRY_SECONDS = 5.0  # from one attempt to store the desired state to the next
 
 
 class Commands(AbstractContextManager["Commands"]):
@@ -35,10 +35,12 @@ class Commands(AbstractContextManager["Commands"]):
     def __init__(self, process: Process, detectors: Detectors) -> None:
         self._process, self._detectors = process, detectors
         self.models = ModelFiles(process.state / SEARCHED)
+        self._file, self._read_problem = process.state / DESIRED, ""
         self.desired = self._first_state(process.job)
         self.boxes: list[Command] = []
         self._responder: Responder[Command, Answer] = Responder(CONTROL, process.endpoint, longest=CONTROL.limit)
         self._stored: DesiredState | None = None  # in the file
+        self._tried = 0.0  # when it was last stored, or could not be
         self._paused_until = 0.0  # end of a pause that ends by itself, as its sender may be gone
         # The last message of an earlier detector: its frames are repeated before a command or a pause applies.
         self._repeated = math.inf if process.job.resume else 0.0
@@ -49,14 +51,12 @@ class Commands(AbstractContextManager["Commands"]):
 
     def _first_state(self, job: Job) -> DesiredState:
         """The desired state at the start: the stored one if the run is resumed, otherwise from the job."""
-        file = self._process.state / DESIRED
-        if job.resume and file.exists():
+        if job.resume and self._file.exists():
             try:
-                desired = DesiredState.load(file)
+                desired = DesiredState.load(self._file)
                 return replace(desired, paused=desired.paused or job.paused)
             except ProtocolError as error:  # the checkpoints are not affected, so the run continues
-                self._process.trouble = str(error)
-                _log.warning("%s", error)
+                self._read_problem = str(error)
         boxes = {name: DesiredObject(box, begins=1) for name, box in job.boxes.items()}
         saved = {name: self.models.add(SavedModel.load(file)) for name, file in job.models.items()}
         return DesiredState(boxes | saved, paused=job.paused)
@@ -93,6 +93,8 @@ class Commands(AbstractContextManager["Commands"]):
         ending = self._process.ending
         if self.desired.stopped:
             ending.begin(STOPPED)
+        if self.desired != self._stored and monotonic() - self._tried >= _RETRY_SECONDS:
+            self.store_and_answer()
         commands = self._responder.receive_all()
         for command in commands:
             if ending.reason and command.verb != "save":
@@ -142,20 +144,26 @@ class Commands(AbstractContextManager["Commands"]):
             self.reject(command, reason)
 
     def store_and_answer(self, *answers: Answer) -> None:
-        """Store the desired state if it has changed, then reply; the reply carries the error if saving failed."""
-        file, desired, problem = self._process.state / DESIRED, self.desired, ""
+        """Store the desired state if it has changed, then reply; the reply carries the error if saving failed.
+
+        `execute` tries that again after some seconds.
+        """
+        desired, problem = self.desired, ""
         if desired != self._stored:
+            self._tried = monotonic()
             try:
-                self.models.store()  # before the state that names them
-                desired.save(file)
+                with writing(self._file):
+                    self.models.store()  # before the state that names them
+                    desired.save(self._file)
                 self._stored = desired
-            except OSError as error:
-                _log.warning("the desired state cannot be written to %s (%s)", file, error.strerror)
-                problem = f"; a resumed run will not know it, as {file} cannot be written ({error.strerror})"
+            except ServiceError as error:
+                problem = f"{error}; until then, a resumed run does not know the newest commands"
+        self._process.trouble = "; ".join(filter(None, (self._read_problem, problem)))
         if desired == self._stored:  # otherwise the file may name a model that is not needed any more
             self.models.keep_only({item.model for item in desired.objects.values()})
         for answered in answers:
-            self._responder.answer(replace(answered, reason=answered.reason + problem) if answered.done else answered)
+            reason = f"{answered.reason}; {problem}" if answered.done and problem else answered.reason
+            self._responder.answer(replace(answered, reason=reason))
 
     def begin_end(self) -> None:
         """No frame follows: the boxes that wait are rejected, and so is every further command except `save`."""

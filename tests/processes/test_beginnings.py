@@ -1,6 +1,7 @@
 """Which objects begin in a frame: those of the job, of commands, and of a resume."""
 
 from contextlib import closing
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -97,6 +98,23 @@ def test_run_resumes_with_its_original_boxes_if_its_state_is_torn(folder, tmp_pa
     with closing(Process("detector", job)) as process, Commands(process, Detectors(process.settings)) as commands:
         assert commands.desired == DesiredState({"anna": DesiredObject(BOX, begins=1)})
         assert "cannot read the desired state" in process.trouble
+
+
+def test_a_desired_state_that_cannot_be_written_is_trouble_until_a_later_attempt_succeeds(stream, monkeypatch):
+    now = [100.0]
+    monkeypatch.setattr("catstream.processes.commands.monotonic", lambda: now[0])
+    commands, process = stream.commands, stream.commands._process
+    file = process.state / DESIRED
+    file.unlink()
+    file.mkdir()
+    commands.change(replace(commands.desired, paused=True))
+    assert process.trouble.startswith(f"cannot write '{file}' (Is a directory): ")
+    file.rmdir()
+    commands.execute()
+    assert not file.exists(), "not in each iteration"
+    now[0] += 5
+    commands.execute()
+    assert (DesiredState.load(file).paused, process.trouble) == (True, "")
 
 
 def test_resumed_object_without_a_state_begins_again_where_it_was(stream):
