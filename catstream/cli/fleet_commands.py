@@ -93,28 +93,23 @@ def up(running: Fleet, view: HostPort | None) -> None:
       catstream fleet up examples/fleet.toml --view
       catstream fleet up fleet.toml --address 10.0.0.1:6379
     """
+    from catstream.web.wall import Wall
+
+    server = None if view is None else server_of(Wall(Address(fleet=running.name)), view)  # it listens already
     with Console(stderr=True).status("starting the fleet"):
         lines = running.up()
     for line in lines:
         click.echo(line)
     with ExitStack() as stack, suppress(KeyboardInterrupt):
-        if view is not None:
-            _serve(running, view, stack)
+        if server is not None:
+            if not running.is_owner:
+                raise click.UsageError("--view needs a fleet that ends with this command: use catstream fleet view")
+            stack.enter_context(server.in_background())
+            for url in server.urls:
+                click.echo(f"page: {url}")
         _watch(screen(), running)
     if running.is_owner and running.is_running:
         _down(running)
-
-
-def _serve(fleet: Fleet, view: HostPort, stack: ExitStack) -> None:
-    """Serve the page of a fleet that ends with this command until the stack is left."""
-    from catstream.web.wall import Wall
-
-    if not fleet.is_owner:
-        raise click.UsageError("--view needs a fleet that ends with this command: use catstream fleet view")
-    server = server_of(Wall(Address(fleet=fleet.name)), view)
-    stack.enter_context(server.in_background())
-    for url in server.urls:
-        click.echo(f"page: {url}")
 
 
 def _down(fleet: Fleet) -> None:

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
 from shlex import quote
+from typing import TYPE_CHECKING
 
 import click
 from rich.console import Console
@@ -47,6 +48,10 @@ from catstream.sinks.destinations import (
 )
 from catstream.sinks.options import parse_rotation
 from catstream.sinks.track_log import OpenFiles, RunFiles, places_of
+
+if TYPE_CHECKING:
+    from catstream.web.feed import PipelineFeed
+    from catstream.web.server import Server
 
 _SAME = 0.95  # overlap of boxes that were meant to be one
 _COMPLETE = (
@@ -226,6 +231,7 @@ class _Run:
                 return
             skip_damaged = pipeline.settings.run.skip_damaged
             pipeline.first_frame, pipeline.first_time = files.position(skip_damaged=skip_damaged)
+        page = None if self.view is None else self._page(self.view)  # a port in use is an error before the run
         progress, interrupted = RunProgress(pipeline), False
         try:
             # The files are closed after the processes, which would track on meanwhile, for none of them; the page is
@@ -233,8 +239,13 @@ class _Run:
             with ExitStack() as closed_last, pipeline:
                 if notice:
                     console.print(notice)
-                if self.view is not None:
-                    self._serve(self.view, closed_last, console)
+                if page is not None:
+                    feed, server = page
+                    feed.address = Address(pipeline.endpoint, keys=pipeline.settings.run.keys)
+                    closed_last.enter_context(server.in_background())
+                    closed_last.callback(feed.wait_for_end)
+                    for url in server.urls:
+                        console.print(f"page: {url}")
                 self._write_tracks(progress, closed_last, console)
         except KeyboardInterrupt:
             interrupted = True
@@ -262,17 +273,14 @@ class _Run:
                 parts.append(f"the state in {self.folder} was removed, so the run cannot be resumed")
             stopped("; ".join(parts))
 
-    def _serve(self, view: HostPort, stack: ExitStack, console: Console) -> None:
-        """Serve the web page of the pipeline until the stack is left."""
+    @staticmethod
+    def _page(view: HostPort) -> tuple[PipelineFeed, Server]:
+        """The web page of a pipeline whose address is not known yet, and its server, which listens already."""
         from catstream.web.app import Site
         from catstream.web.feed import PipelineFeed
 
-        feed = PipelineFeed(Address(self.pipeline.endpoint, keys=self.pipeline.settings.run.keys))
-        server = server_of(Site(feed), view)
-        stack.enter_context(server.in_background())
-        stack.callback(feed.wait_for_end)
-        for url in server.urls:
-            console.print(f"page: {url}")
+        feed = PipelineFeed(Address())
+        return feed, server_of(Site(feed), view)
 
     def _write_tracks(self, progress: RunProgress, stack: ExitStack, console: Console) -> None:
         """Write every track to all files, which the stack closes, and show it."""

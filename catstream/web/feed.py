@@ -39,11 +39,11 @@ class PipelineFeed:
     """Receives the messages of a pipeline from `start` to `stop`, and reconnects after each end, silence or restart.
 
     Previews, which cost the pipeline processor time, are received only while a page is open, or a wall asks for
-    pictures. The address is resolved at each connection.
+    pictures. The `address` is resolved at each connection, first after `start`.
     """
 
     def __init__(self, address: Address) -> None:
-        self._address = address
+        self.address = address
         self._endpoint: Endpoint | None = None  # of the current connection, with its keys
         self._has_end = threading.Event()
         self.viewers = 0  #: open pages
@@ -92,7 +92,7 @@ class PipelineFeed:
 
     def execute(self, **command: Any) -> Answer:
         """Send a command, by its fields, to the pipeline, and wait for its answer."""
-        with Control(self._endpoint or self._address.resolve()) as pipeline:
+        with Control(self._endpoint or self.address.resolve()) as pipeline:
             return pipeline.execute(**command)
 
     def _run(self) -> None:
@@ -114,7 +114,7 @@ class PipelineFeed:
 
     def _feed(self) -> None:
         """Feed the dashboard until the connection is lost."""
-        self._endpoint = self._address.resolve()
+        self._endpoint = self.address.resolve()
         self._call(self.dashboard.attach, str(self._endpoint))
         subscriptions: dict[str, Subscription[Any]] = {}
         try:

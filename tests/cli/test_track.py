@@ -5,6 +5,7 @@ import errno
 import json
 import os
 import signal
+import socket
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, suppress
 from pathlib import Path
@@ -148,6 +149,15 @@ def test_bad_input_is_rejected_in_one_line_and_nothing_is_written(video, fail, t
     error = fail("track", *given, "--output", "out", cwd=tmp_path)
     assert word in error
     assert [file.name for file in tmp_path.iterdir()] == ["notes.txt"]
+
+
+def test_a_port_of_the_page_that_is_in_use_is_an_error_before_the_run(video, fail, tmp_path):
+    source, box = video
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+        line = fail("track", source, "--box", box, "--state", tmp_path / "state", "--view", port)
+    assert f"cannot listen on 127.0.0.1:{port} (Address already in use)" in line
+    assert not (tmp_path / "state").exists()
 
 
 @pytest.mark.parametrize("output", ["a file", "/proc/catstream"])
