@@ -10,6 +10,8 @@ from __future__ import annotations
 import shlex
 import shutil
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -76,6 +78,15 @@ class FencedError(FleetError):
 
 class StoreError(FleetError):
     """The store of a fleet is unreachable, full or damaged. The call may be repeated later."""
+
+
+@contextmanager
+def errors_in(where: str, kind: type[CatstreamError]) -> Iterator[None]:
+    """A block whose errors become errors of this kind, with the place before their text."""
+    try:
+        yield
+    except CatstreamError as error:
+        raise kind(f"{where}: {error}") from None
 
 
 def require_linux() -> None:

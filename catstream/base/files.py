@@ -191,16 +191,18 @@ def _flock(handle: int, kind: str) -> bool:
 
 
 def open_locked(path: Path, kind: type[CatstreamError] = ServiceError, size: int | None = 0, **options: Any) -> IO[Any]:
-    """Open a file to append to it, and lock it until it is closed; see `open` for the `options`.
+    """Open a file to append to it, in a folder that is made, and lock it until it is closed.
 
-    size  number of its first bytes that remain, 0 for a new file; None for all
+    size     number of its first bytes that remain, 0 for a new file; None for all
+    options  of `open`
 
     An error of this kind if another process has locked it, or if it cannot be written.
     """
     with writing(path, kind), contextlib.ExitStack() as stack:
+        path.parent.mkdir(parents=True, exist_ok=True)
         file: IO[Any] = stack.enter_context(path.open(**{"mode": "a", **options}))
         if not lock(file.fileno()):
-            raise kind(f"{path} is being written by {_holder(path)}: stop it, or pass another path")
+            raise kind(_busy(path))
         if size is not None and stat.S_ISREG(os.fstat(file.fileno()).st_mode):
             file.truncate(size)
         stack.pop_all()
@@ -225,7 +227,7 @@ def locked_folder(
             folder.mkdir(mode, parents=True, exist_ok=True)
             handle = None if fcntl is None else stack.enter_context(descriptor(folder, os.O_DIRECTORY))
         if handle is not None and not lock(handle, seconds):
-            raise kind(busy or f"{folder} is being written by {_holder(folder)}: stop it, or pass another path")
+            raise kind(busy or _busy(folder))
         yield
 
 
@@ -234,16 +236,17 @@ def check_unlocked(path: Path, kind: type[CatstreamError] = ServiceError) -> Non
     # A pipe without a writer would block.
     with contextlib.suppress(OSError), descriptor(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0)) as handle:
         if is_locked(handle):
-            raise kind(f"{path} is being written by {_holder(path)}: stop it, or pass another path")
+            raise kind(_busy(path))
 
 
-def _holder(path: Path) -> str:
-    """The process that has locked a file, for an error; the kernel lists the locks of this machine."""
+def _busy(path: Path) -> str:
+    """The error about a file that a process has locked, with its id: the kernel lists the locks of this machine."""
+    holder = "another process"
     with contextlib.suppress(OSError):
         locks = Path("/proc/locks").read_text()
         if entry := re.search(rf"FLOCK +ADVISORY +WRITE +([1-9]\d*) \S+:{path.stat().st_ino} ", locks):
-            return f"process {entry[1]}"
-    return "another process"
+            holder = f"process {entry[1]}"
+    return f"{path} is being written by {holder}: stop it, or pass another path"
 
 
 def check_distinct(files: Iterable[tuple[str, Path]], kind: type[CatstreamError] = ServiceError) -> None:

@@ -135,7 +135,7 @@ def demo(output: Path, frames: int, render_only: bool, live: str | None) -> None
     arguments = [str(video), "--box", str(boxes[0]), "--output", str(tracks), "--video", "--overwrite"]
     track.main(arguments, prog_name="catstream track", standalone_mode=False)
     truth = np.array([box or (np.nan,) * 4 for box in boxes])
-    tracked = [frame.tracks[0].box for frame in Log(tracks / "demo.ndjson").frames()]
+    tracked = [frame.tracks[0].box for frame in Log(tracks / "demo.ndjson")]
     result = score(np.array([box or (np.nan,) * 4 for box in tracked]), truth)
     click.echo(f"success rate: {result.success:.3f} (IoU with the ground truth above 0.5)")
     if result.absent:

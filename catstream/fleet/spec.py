@@ -11,8 +11,7 @@ import hashlib
 import json
 import re
 import reprlib
-from collections.abc import Collection, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -26,7 +25,7 @@ from catstream.base.box import Box
 from catstream.base.names import UNNAMED, boxes_by_name, by_name
 from catstream.base.settings import Settings, flat, read_toml
 from catstream.base.text import listed
-from catstream.errors import CatstreamError, FleetError
+from catstream.errors import CatstreamError, FleetError, errors_in
 from catstream.jobs.job import Job, changed_setting
 from catstream.sinks.destinations import SinkOptions, redacted
 from catstream.sinks.options import KEYS, destinations
@@ -89,13 +88,13 @@ class StreamSpec:
 
     def __post_init__(self) -> None:
         check_fleet_name(self.name, "stream")
-        with _errors_in(f"the stream {self.name}"):
+        with errors_in(f"the stream {self.name}", FleetError):
             if not self.source.strip():
                 raise FleetError(
                     'missing source: add one as for `catstream track`, for example source = "rtsp://camera/1"'
                 )
             for name, box in self.boxes.items():
-                with _errors_in(f"the box of {listed([name])}"):
+                with errors_in(f"the box of {listed([name])}", FleetError):
                     box.checked()
             Job(self.source, self.boxes, self.models, settings=Settings.from_values(self.settings))
             _checked({"cores": self.cores}, _STREAM)
@@ -106,7 +105,7 @@ class StreamSpec:
     ) -> StreamSpec:
         """Make a stream from the table of a file in `folder`; values that it lacks are the defaults."""
         check_fleet_name(name, "stream")
-        with _errors_in(f"the stream {name}"):
+        with errors_in(f"the stream {name}", FleetError):
             if not isinstance(table, Mapping):
                 got = table if isinstance(table, int) else type(table).__name__  # a text may contain a password
                 raise FleetError(f"expected a table with a source, got {got}: write [streams.{name}]")
@@ -164,7 +163,7 @@ class FleetSpec:
 
     def __post_init__(self) -> None:
         check_fleet_name(self.name, "fleet")
-        with _errors_in(f"the fleet {self.name}"):
+        with errors_in(f"the fleet {self.name}", FleetError):
             _checked({key: getattr(self, key) for key in _AT_START}, _FLEET)
             owners: dict[str, str] = {}
             for name, place in ((name, place) for name, stream in self.streams.items() for place in stream.write):
@@ -176,7 +175,7 @@ class FleetSpec:
     def load(cls, path: Path) -> FleetSpec:
         """Read the file of a fleet; FleetError if it has no streams, or has a key or value that is not valid."""
         tables = read_toml(path, FleetError)
-        with _errors_in(str(path)):
+        with errors_in(str(path), FleetError):
             values, folder = {"name": path.stem} | _checked(tables, _FLEET), path.parent.absolute()
             if not values.get("streams"):
                 raise FleetError(
@@ -184,7 +183,7 @@ class FleetSpec:
                 )
             if (store := values.get("store")) and "://" not in store:
                 values["store"] = str(folder / store)
-            with _errors_in("the defaults"):
+            with errors_in("the defaults", FleetError):
                 defaults = _checked(values.pop("defaults", {}), _STREAM)
             tables = values.pop("streams")
             streams = {name: StreamSpec.parse(name, table, folder, defaults) for name, table in tables.items()}
@@ -271,12 +270,3 @@ def check_fleet_name(name: object, kind: str) -> None:
             f"{reprlib.repr(name)} is not a valid name of a {kind}: expected 1 to 64 letters, digits, '_', '-' and "
             "'.', the first of them a letter, a digit or '_'"
         )
-
-
-@contextmanager
-def _errors_in(where: str) -> Iterator[None]:
-    """Add the place to the errors of catstream."""
-    try:
-        yield
-    except CatstreamError as error:
-        raise FleetError(f"{where}: {error}") from None

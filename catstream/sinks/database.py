@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from catstream.base.box import Box
-from catstream.base.files import REMEDIES, open_locked, writing
+from catstream.base.files import REMEDIES, open_locked
 from catstream.base.text import counted
 from catstream.errors import VideoError
 from catstream.messages.kinds import Track
@@ -134,8 +134,6 @@ class SqliteSink:
             self._database.close()
         self._database = None
         self._lock.close()
-        with writing(path, VideoError):
-            path.parent.mkdir(parents=True, exist_ok=True)
         self._lock = open_locked(path, VideoError, None)
 
 

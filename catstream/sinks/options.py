@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from math import inf
 from pathlib import Path
@@ -14,7 +13,7 @@ import msgspec
 from msgspec import Meta
 
 from catstream.base.addresses import without_password
-from catstream.errors import CatstreamError, SettingsError
+from catstream.errors import SettingsError, errors_in
 from catstream.sinks.destinations import STDOUT, Rotation, SinkOptions, check_sink, kind_of
 from catstream.sinks.events import KINDS, WHEN, Point, check_zones
 
@@ -162,7 +161,7 @@ def parse(values: Mapping[str, Any], places: Sequence[str], name_of: Callable[[s
             users = " or ".join(option.users)
             always = " (a folder always has pictures)" if name == "picture" and "/" in kinds else ""
             raise SettingsError(f"{name_of(name)} has no effect on these destinations{always}: omit it, or add {users}")
-        with _errors_of(name_of(name)):
+        with errors_in(name_of(name), SettingsError):
             try:
                 fields[name] = option.convert(msgspec.convert(value, option.kind, strict=False))
             except msgspec.ValidationError:
@@ -194,18 +193,9 @@ def destinations(
     if "secret_file" in given:
         given["secret_file"] = located(given["secret_file"].replace("{stream}", stream))
     options = parse(given, places)
-    with _errors_of("write"):
+    with errors_in("write", SettingsError):
         for place in places:
             if place == STDOUT:
                 raise SettingsError("there is no standard output: pass a file or an address")
             check_sink(place, options, without_password(source))
     return places, options
-
-
-@contextmanager
-def _errors_of(name: str) -> Iterator[None]:
-    """Turn each error into a SettingsError that names the option."""
-    try:
-        yield
-    except CatstreamError as error:
-        raise SettingsError(f"{name}: {error}") from None

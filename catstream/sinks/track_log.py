@@ -80,8 +80,8 @@ class LineSink(ABC):
         self._open(origin.size)
 
     @abstractmethod
-    def first_line(self, origin: Origin) -> str:
-        """Return the first line of a file, without its line end; empty for none."""
+    def head_line(self, gap: int = 0) -> str:
+        """Return the first line of a file, or the one after a gap of some frames, without its end; empty for none."""
 
     @abstractmethod
     def line(self, track: Track, seconds: float) -> str:
@@ -96,7 +96,7 @@ class LineSink(ABC):
             with writing(self.path, VideoError):
                 if self._gap:
                     self._remove_part()
-                    lines = [*self.gap_lines(self._gap), *lines]
+                    lines = [*filter(None, [self.head_line(self._gap)]), *lines]
                 self._write(lines)
         except VideoError:
             self._gap += 1
@@ -131,10 +131,6 @@ class LineSink(ABC):
         with writing(self.path, VideoError):
             self._file.close()
 
-    def gap_lines(self, frames: int) -> list[str]:  # noqa: ARG002
-        """Return lines that state how many frames before the next one could not be written."""
-        return []
-
     def _write(self, lines: list[str]) -> None:
         """Write without a buffer, which would keep what the disk did not take."""
         data = "".join(f"{line}\n" for line in lines).encode()
@@ -148,7 +144,7 @@ class LineSink(ABC):
     def _open(self, size: int) -> None:
         self._file: IO[bytes] = open_locked(self.path, VideoError, size, mode="ab", buffering=0)
         with writing(self.path, VideoError), ExitStack() as stack:
-            if (first := self.first_line(self._origin)) and not size:  # a file with no room for it is removed
+            if (first := self.head_line()) and not size:  # a file with no room for it is removed
                 stack.callback(self.path.unlink)
                 stack.enter_context(self._file)
                 self._write([first])
@@ -167,19 +163,14 @@ class LineSink(ABC):
         if not self._gap and not self._is_rotated:
             Warnings(str(self.path)).log(f"{problem} by another program; the log goes on there without the rows before")
         self._file.close()
-        with writing(self.path, VideoError):
-            self.path.parent.mkdir(parents=True, exist_ok=True)
         self._open(rest)
 
 
 class NdjsonSink(LineSink):
     """After the head, a line of JSON for each track, as by `Track.to_dict`: a box is [x, y, w, h] or null."""
 
-    def first_line(self, origin: Origin) -> str:
-        return origin.head.to_json()
-
-    def gap_lines(self, frames: int) -> list[str]:
-        return [replace(self._origin.head, gap=frames).to_json()]
+    def head_line(self, gap: int = 0) -> str:
+        return replace(self._origin.head, gap=gap).to_json()
 
     def line(self, track: Track, _: float) -> str:
         return json.dumps(track.to_dict())
@@ -191,7 +182,7 @@ class StdoutSink(NdjsonSink):
     def __init__(self, _: str, origin: Origin) -> None:
         super().__init__("standard output", origin)
 
-    def first_line(self, _: Origin) -> str:
+    def head_line(self, _: int = 0) -> str:
         return ""
 
     def _open(self, _: int) -> None:
@@ -203,9 +194,6 @@ class StdoutSink(NdjsonSink):
     def _remove_part(self) -> None:
         pass
 
-    def gap_lines(self, _: int) -> list[str]:
-        return []
-
 
 class CsvSink(LineSink):
     """Tracks as rows of comma-separated values; `processing` is the time that the frame took, empty if not known.
@@ -213,8 +201,8 @@ class CsvSink(LineSink):
     `checked` and `probability` are empty but for an annotation.
     """
 
-    def first_line(self, _: Origin) -> str:
-        return ",".join(_COLUMNS)
+    def head_line(self, gap: int = 0) -> str:
+        return "" if gap else ",".join(_COLUMNS)
 
     def line(self, track: Track, seconds: float) -> str:
         box = ",,," if track.box is None else ",".join(f"{side:.4f}" for side in track.box)
@@ -255,7 +243,7 @@ class Log:
         with self.path.open("rb") as file:
             return Head.from_json(file.readline())
 
-    def frames(self) -> Iterator[TrackedFrame]:
+    def __iter__(self) -> Iterator[TrackedFrame]:
         """Yield the frames in their order, in whichever order the rows are; none if there is no file.
 
         VideoError if an object has two rows in a frame.
@@ -273,9 +261,6 @@ class Log:
             if twice := {name for name in names if names.count(name) > 1}:
                 raise VideoError(f"{self.path} has two rows of {listed(sorted(twice))} in frame {number}: remove one")
             yield frame
-
-    def __iter__(self) -> Iterator[TrackedFrame]:
-        return self.frames()
 
     def last_whole_frame(self) -> tuple[TrackedFrame | None, int]:
         """Return the last frame that is complete, None if there is none, and the byte at which it ends."""
@@ -361,7 +346,7 @@ def logs_of(files: Iterable[Path], *, skip_damaged: bool = False) -> list[Log]:
         paths += found
     logs = [Log(path, skip_damaged=skip_damaged) for path in paths]
     for log in logs:
-        if next(log.frames(), None) is None:
+        if next(iter(log), None) is None:
             raise VideoError(f"{log.path} contains no tracks")
     return logs
 
@@ -378,15 +363,15 @@ class JoinedLog(Log):
     """The rotated files of one run, read as one log. VideoError if they are of several sources, or repeat a frame."""
 
     def __init__(self, logs: Iterable[Log]) -> None:
-        self._logs = sorted(logs, key=lambda log: next(log.frames()).number)
+        self._logs = sorted(logs, key=lambda log: next(iter(log)).number)
         if len({(log.head() or Head()).source for log in self._logs}) > 1:
             raise VideoError("the logs are of several sources: pass the files of one run, or --format yolo")
         super().__init__(self._logs[-1].path)
 
-    def frames(self) -> Iterator[TrackedFrame]:
+    def __iter__(self) -> Iterator[TrackedFrame]:
         last = -1
         for log in self._logs:
-            for frame in log.frames():
+            for frame in log:
                 if frame.number <= last:
                     raise VideoError(f"{log.path} has frame {frame.number} again: pass the files of one run")
                 last = frame.number
@@ -497,7 +482,7 @@ class RunFiles:
             outputs = stack.enter_context(OpenFiles(origins, is_live=is_live(origin.head.source)))
             # The other files are made again from the log.
             followers = [place for place in self.places if is_file(place) and Path(place) != path]
-            for frame in log.frames() if log is not None and last is not None and followers else ():
+            for frame in log if log is not None and last is not None and followers else ():
                 for place in followers:
                     outputs.write_to(place, frame)
             stack.pop_all()
@@ -564,9 +549,6 @@ class OpenFiles(AbstractContextManager["OpenFiles"]):
         """Open a destination if it is not open, and write a frame to it; return whether that was possible."""
         try:
             if place not in self._sinks:
-                if is_file(place):
-                    with writing(place, VideoError):
-                        Path(place).parent.mkdir(parents=True, exist_ok=True)
                 sink = open_sink(place, replace(self._origins[place], gap=self.not_written))
                 self._sinks[place] = self._stack.enter_context(closing(sink))
             if frame is not None:

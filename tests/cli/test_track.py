@@ -31,7 +31,7 @@ def table(path):
 
 def frames_of(folder, name="demo"):
     """The frames whose tracks are in the log."""
-    return [frame.number for frame in Log(folder / f"{name}.ndjson").frames()]
+    return [frame.number for frame in Log(folder / f"{name}.ndjson")]
 
 
 def test_it_writes_a_log_in_two_forms_and_a_video(whole_run):

@@ -29,14 +29,14 @@ from pathlib import Path
 from catstream.sinks.destinations import Origin, TrackedFrame, open_sink
 from catstream.sinks.track_log import Log
 sink = open_sink(sys.argv[1], Origin())
-for frame in Log(Path(sys.argv[2])).frames():
+for frame in Log(Path(sys.argv[2])):
     sink.write(frame)
 os.kill(os.getpid(), signal.SIGKILL)
 """
 
 
 def read(path):
-    return [frame.tracks for frame in Log(path).frames()]
+    return [frame.tracks for frame in Log(path)]
 
 
 def test_each_frame_is_in_the_database_at_once_for_others_who_do_not_block_it(tmp_path):
@@ -106,7 +106,7 @@ def test_frames_wait_in_memory_while_another_program_locks_the_database(tmp_path
                 sink.write(TrackedFrame([track]))
             assert read(path) == []
         sink.write(TrackedFrame([replace(TRACKS[0], frame=9)]))
-        assert [frame.number for frame in Log(path).frames()] == [0, 1, 3, 9]
+        assert [frame.number for frame in Log(path)] == [0, 1, 3, 9]
     assert [message.rpartition(": ")[2] for message in caplog.messages] == [
         "locked by another program; frames wait in memory",
         "recovered",
@@ -125,7 +125,7 @@ def test_frames_beyond_those_that_wait_are_counted_and_reported_at_the_end(tmp_p
     sink.write(TrackedFrame([replace(TRACKS[0], frame=9)]))
     with pytest.raises(VideoError, match="lacks 2 frames, as another program locked it"):
         sink.close()
-    assert [frame.number for frame in Log(path).frames()] == [3, 9]
+    assert [frame.number for frame in Log(path)] == [3, 9]
 
 
 def test_a_database_has_the_head_of_the_run_and_an_export_keeps_it(tmp_path):

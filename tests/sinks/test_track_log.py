@@ -72,9 +72,9 @@ def test_an_open_file_is_read_back_up_to_a_line_that_a_power_cut_tore(tmp_path, 
         whole = path.read_bytes()
         for torn in (b"", whole.splitlines()[-1][:9] + bytes(7), bytes(4096), b"\n"):
             path.write_bytes(whole + torn)
-            found = list(Log(path).frames())
+            found = list(Log(path))
             assert [frame.tracks for frame in found] == [[track] for track in kept]
-    assert list(Log(tmp_path / f"none{suffix}").frames()) == []
+    assert list(Log(tmp_path / f"none{suffix}")) == []
 
 
 @pytest.mark.parametrize("name", ["t.ndjson", "t.csv"])
@@ -85,7 +85,7 @@ def test_a_full_disk_is_reported_in_one_line_and_written_rows_are_kept(tmp_path,
     with pytest.raises(VideoError, match=rf"cannot write '.*/{name}' \(No space left on device\)"):
         sink.write(TrackedFrame(TRACKS[1:2]))
     sink.close()
-    assert len(list(Log(tmp_path / name).frames())) == 1
+    assert len(list(Log(tmp_path / name))) == 1
 
 
 @pytest.mark.parametrize("disk", [1 << 20], indirect=True)
@@ -337,11 +337,11 @@ def test_a_damaged_line_before_the_end_is_an_error_with_its_number_or_skipped(tm
     add(RunFiles(Origin(), None, [str(log)]), [[""]] * 9)
     lines = log.read_bytes().splitlines(keepends=True)
     log.write_bytes(b"".join([*lines[:5], damage, *lines[5:]]))
-    for read in (lambda: list(Log(log).frames()), RunFiles(Origin(), None, [str(log)]).position):
+    for read in (lambda: list(Log(log)), RunFiles(Origin(), None, [str(log)]).position):
         with pytest.raises(VideoError, match=rf"{name}, line 6 is no track .*--skip-damaged"):
             read()
     skipping = Log(log, skip_damaged=True)
-    assert [frame.number for frame in skipping.frames()] == list(range(9))
+    assert [frame.number for frame in skipping] == list(range(9))
     assert skipping.damaged == 1
     assert RunFiles(Origin(), None, [str(log)]).position(skip_damaged=True)[0] == 9
 
@@ -385,7 +385,7 @@ def table(path, columns, separator=",", change=lambda rows: rows, encoding="utf-
     ],
 )  # fmt: skip
 def test_a_csv_file_is_read_by_the_names_of_its_columns_in_any_order_of_rows(tmp_path, form):
-    frames = list(Log(table(tmp_path / "t.csv", **form)).frames())
+    frames = list(Log(table(tmp_path / "t.csv", **form)))
     assert [frame.number for frame in frames] == list(range(5))
     for frame in frames:
         boxes = {track.object: track.box for track in frame.tracks}
@@ -406,7 +406,7 @@ def test_a_csv_file_is_read_by_the_names_of_its_columns_in_any_order_of_rows(tmp
 )  # fmt: skip
 def test_a_csv_file_that_is_ambiguous_is_an_error_that_says_what_is_wrong(tmp_path, form, words):
     with pytest.raises(VideoError, match=words):
-        list(Log(table(tmp_path / "t.csv", **form)).frames())
+        list(Log(table(tmp_path / "t.csv", **form)))
 
 
 @pytest.mark.parametrize("name", ["t.ndjson", "t.csv", "t.sqlite"])
@@ -449,7 +449,7 @@ def test_a_log_that_is_removed_or_truncated_is_written_anew_and_that_is_said_onc
                     "folder": lambda: path.parent.rename(tmp_path / "old"),
                     "truncated": lambda: os.truncate(path, 0),
                 }[change]()
-    assert [frame.number for frame in Log(path).frames()] == [3, 4, 5]
+    assert [frame.number for frame in Log(path)] == [3, 4, 5]
     assert b"\0" not in path.read_bytes() or name == "t.sqlite"
     (message,) = caplog.messages
     assert "truncated by another program" in message or "removed or renamed by another program" in message
@@ -463,7 +463,7 @@ def test_csv_and_database_are_made_again_from_the_ndjson_log_when_a_run_is_resum
     Path(places[1]).unlink()
     add(run, [[""]] * 9, first=run.position()[0], resume=True)
     for place in places:
-        assert [frame.number for frame in Log(Path(place)).frames()] == list(range(9))
+        assert [frame.number for frame in Log(Path(place))] == list(range(9))
 
 
 def test_all_files_of_a_run_are_different_also_through_links(tmp_path):
@@ -484,5 +484,5 @@ def test_logs_that_were_joined_have_a_head_each_and_the_frames_of_both(tmp_path)
     parts = [Head(size=(4, 3)).to_json(), tracks[0], Head().to_json(), tracks[1]]
     log = tmp_path / "t.ndjson"
     log.write_text("".join(f"{part}\n" for part in parts))
-    assert [frame.number for frame in Log(log).frames()] == [0, 1]
+    assert [frame.number for frame in Log(log)] == [0, 1]
     assert Log(log).head() == Head(size=(4, 3))
