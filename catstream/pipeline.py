@@ -25,8 +25,8 @@ from catstream.base.names import Boxes
 from catstream.base.settings import Settings
 from catstream.errors import ServiceError, SettingsError
 from catstream.jobs.job import Job, Models, Results, files_by_name
-from catstream.jobs.probe import prepared, probe
-from catstream.jobs.state import check_new, last_seq, last_time, locked_for_run, saved
+from catstream.jobs.probe import probe
+from catstream.jobs.state import check_new, locked_for_run, position, saved
 from catstream.messages.kinds import RunState, Track, run_state
 from catstream.processes.start_server import start_server
 from catstream.processes.supervisor import Supervisor
@@ -150,8 +150,8 @@ class Pipeline:
             self._earlier, self._state = Job.load(Path(resume)), Path(resume).absolute()
             job = self._earlier.resumed(text, settings, part=part, results=results, paused=paused)
         self._save_models = job.results.models if save_model is None else _writable(save_model)
-        info = probe(job)
-        self._job = job = prepared(job, info)
+        job, info = probe(job)
+        self._job = job
         if self._earlier is not None and self._state is not None:
             self._earlier.check_fits(job, self._state)
         self.name, self.frames, self.rate, self.size, self.live = info
@@ -192,7 +192,7 @@ class Pipeline:
         """
         passed = 0.0
         if self.live and self._earlier is not None and self._state is not None:
-            passed = max(last_time(self._state), self.first_time) + self.settings.run.checkpoint_seconds
+            passed = max(position(self._state)[1], self.first_time) + self.settings.run.checkpoint_seconds
         return replace(
             self._job,
             endpoint=endpoint,
@@ -372,7 +372,7 @@ class Pipeline:
         # Frames of a live source cannot be read again: the checkpoint may be ahead of the tracks.
         if self.first_frame is not None and not self.live:
             return self.first_frame
-        return max(last_seq(self._state), self.first_frame or 0)
+        return max(position(self._state)[0], self.first_frame or 0)
 
 
 def _check_exclusive(state: object, resume: object, box: object, model: object) -> None:

@@ -31,24 +31,19 @@ class SourceInfo(NamedTuple):
     live: bool
 
 
-def probe(job: Job) -> SourceInfo:
-    """Open the source of a job, and close it again: the detector opens it, and only one program can open a camera.
+def probe(job: Job) -> tuple[Job, SourceInfo]:
+    """The job with what depends on its source, and absolute paths: its processes have another current folder.
 
-    SettingsError if the settings do not suit the source, VideoError if it cannot be read.
+    The source is opened, and closed again: the detector opens it, and only one program can open a camera.
+    SettingsError if the settings do not suit the source, VideoError if it cannot be read; BoxError if a box is not in
+    the frame; ServiceError or ProtocolError if a saved model cannot be used.
     """
     if job.settings.run.lockstep and is_live(job.source):
         raise SettingsError("a live source does not wait, so its runs are not reproducible: omit lockstep")
     with open_source(job.source, part=job.part, settings=job.settings.run) as source:
-        return SourceInfo(source.name, source.frames, source.rate, source.size, source.live)
-
-
-def prepared(job: Job, info: SourceInfo) -> Job:
-    """The job with what depends on its source, and absolute paths: its processes have another current folder.
-
-    BoxError if a box is not in the frame; ServiceError or ProtocolError if a saved model cannot be used.
-    """
+        info = SourceInfo(source.name, source.frames, source.rate, source.size, source.live)
     check_boxes(job.boxes, *info.size)
     settings = job.settings.for_length(info.frames)
     check_files(job.models, settings)
-    source = job.source if info.live else str(Path(job.source).absolute())
-    return replace(job, source=source, size=info.size, rate=info.rate, settings=settings)
+    path = job.source if info.live else str(Path(job.source).absolute())
+    return replace(job, source=path, size=info.size, rate=info.rate, settings=settings), info

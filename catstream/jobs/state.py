@@ -54,14 +54,9 @@ def files_of_state(folder: Path) -> dict[str, Path]:
     return {"the state folder": folder} | {f"{name} of the state": folder / name for name in (*_SMALL, CHECKPOINTS)}
 
 
-def last_seq(folder: Path) -> int:
-    """Number of the last message in the newest valid checkpoint: the run is resumed after it."""
-    return CheckpointStore(folder / CHECKPOINTS).position()[0]
-
-
-def last_time(folder: Path) -> float:
-    """Time of the frame of that message, in seconds."""
-    return CheckpointStore(folder / CHECKPOINTS).position()[1]
+def position(folder: Path) -> tuple[int, float]:
+    """Number of the last message in the newest valid checkpoint, after which the run is resumed, and its time."""
+    return CheckpointStore(folder / CHECKPOINTS).position()
 
 
 def learned(folder: Path, settings: Settings, name: str = UNNAMED) -> SavedModel:

@@ -58,15 +58,13 @@ class Owner(ctypes.Structure):
 class SharedMemory:
     """The two records, in the memory of a descriptor or in new memory."""
 
-    def __init__(self, handle: int | None = None, after: int = 0) -> None:
+    def __init__(self, handle: int | None = None) -> None:
         self.handle = os.memfd_create("catstream") if handle is None else handle
         size = ctypes.sizeof(Watchdog) + ctypes.sizeof(Owner)
         os.truncate(self.handle, size)
         memory = mmap.mmap(self.handle, size)
         self.watchdog = Watchdog.from_buffer(memory)
         self.owner = Owner.from_buffer(memory, ctypes.sizeof(Watchdog))
-        if handle is None:
-            self.owner.after = self.owner.read = after
         self.watchdog.allow()
 
     def close(self) -> None:

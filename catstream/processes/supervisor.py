@@ -106,11 +106,9 @@ class Child:
     def start(self, after: int) -> None:
         """Start the process; the owner of the run has the frames up to message `after`."""
         self.end()
-        self.memory.close()
-        before, self.memory = self.memory.owner, SharedMemory(after=after)
-        self.memory.owner.not_written, self.memory.owner.trouble = before.not_written, before.trouble
-        self._turns = self.silent = 0.0
-        self.hung = False
+        self.memory.owner.after = self.memory.owner.read = after
+        self.memory.watchdog.allow()
+        self.silent, self.hung = 0.0, False
         self.log.begin()
         log, memory = self.log.fileno(), self.memory.handle
         self.process = start_server().start(self.name, self._job, log, memory, restarted=bool(self.restarts))

@@ -7,7 +7,7 @@ from itertools import islice
 import pytest
 
 from catstream.errors import ServiceError
-from catstream.jobs.state import files, last_seq, restore
+from catstream.jobs.state import files, position, restore
 from catstream.pipeline import Pipeline
 from catstream.processes.decisions import DESIRED, DesiredState
 from catstream.video.live_demo import first_box
@@ -36,7 +36,7 @@ def test_a_restored_state_is_at_the_same_position(state, tmp_path):
     assert Pipeline(resume=tmp_path / "there").frames == 12
     assert {"job.safetensors", "desired_state.json"} < content.keys()
     assert files(tmp_path / "there") == content
-    assert last_seq(tmp_path / "there") == 12
+    assert position(tmp_path / "there")[0] == 12
 
 
 @pytest.mark.parametrize("name", ["../other", "searched_models/../x", "/etc/passwd", "trees/1.safetensors.part"])
@@ -71,7 +71,7 @@ def test_a_run_continues_after_the_last_frame_that_the_program_has_whole(video, 
     boxes, settings = {"anna": truth[0], "ben": truth[0]}, {"run.lockstep": lockstep}
     with Pipeline(path, boxes, settings, state=tmp_path / "state") as pipeline:
         before = [*islice(pipeline, 2 * 8 + 1)]
-        until(lambda: last_seq(tmp_path / "state") > 9)  # the checkpoint is ahead
+        until(lambda: position(tmp_path / "state")[0] > 9)  # the checkpoint is ahead
     with Pipeline(resume=tmp_path / "state", after=before[-1].frame - 1) as pipeline:
         after = list(pipeline)
     missing = [(frame, name) for frame in range(8, len(truth)) for name in boxes]
@@ -90,13 +90,13 @@ def test_a_live_run_continues_its_frames_and_times_after_a_power_cut(tmp_path):
     state, trees, settings = tmp_path / "state", tmp_path / "state" / "trees", {"run.checkpoint_seconds": 0.1}
     with Pipeline("demo:1", first_box("demo:1"), settings, state=state) as pipeline:
         tracks = iter(pipeline)
-        while last_seq(state) < 10:
+        while position(state)[0] < 10:
             next(tracks)
         shutil.copytree(trees, tmp_path / "older")
         *_, last = islice(tracks, 60)
     shutil.rmtree(trees)
     shutil.copytree(tmp_path / "older", trees)
-    assert last_seq(state) < last.frame
+    assert position(state)[0] < last.frame
     pipeline = Pipeline(resume=state, after=last.frame)
     pipeline.first_time = last.time
     with pipeline:
