@@ -53,15 +53,9 @@ class Results:
     keep: int | None = None
 
     def after(self, earlier: Results) -> Results:
-        """These files, and of a kind of which there is none the files of the earlier part of the run."""
-        return Results(
-            output=self.output or earlier.output,
-            video=earlier.video if self.video is None else self.video,
-            write=earlier.write if self.write is None else self.write,
-            models=self.models or earlier.models,
-            rotate=self.rotate or earlier.rotate,
-            keep=self.keep or earlier.keep,
-        )
+        """The files of the earlier part of the run, replaced by these where they are set."""
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        return replace(earlier, **{name: value for name, value in values.items() if value not in (None, {})})
 
 
 @dataclass(frozen=True, slots=True)

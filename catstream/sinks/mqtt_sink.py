@@ -17,7 +17,7 @@ import json
 import ssl
 import sys
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from enum import Enum, auto
 from hashlib import blake2b
 from typing import Any
@@ -28,7 +28,7 @@ from paho.mqtt.enums import CallbackAPIVersion, MQTTErrorCode
 
 from catstream.base.text import counted
 from catstream.errors import VideoError
-from catstream.messages.kinds import Preview, Track
+from catstream.messages.kinds import Preview
 from catstream.sinks.destinations import Origin, SinkOptions, TrackedFrame, redacted
 from catstream.sinks.events import Event
 from catstream.sinks.remote import CLOSE_SECONDS, QUEUED, EventStream, Warnings, reason_of, split
@@ -87,21 +87,17 @@ class MqttSink:
 
     def write(self, frame: TrackedFrame) -> None:
         """Publish the events of a frame, and the states that have changed or are due."""
-        self._update(frame.tracks)
-
-    def idle(self) -> None:
-        """Publish the events that have waited for a picture, and whether the source is lost."""
-        self._update(())
-
-    def _update(self, tracks: Sequence[Track]) -> None:
-        self._check_link()
+        if self._link is _Link.CONNECTED:
+            self._warnings.working()
+        elif self._link is _Link.CONNECTING and time.monotonic() - self._attempted > _REPLY_SECONDS:
+            self._warnings.failed(f"no reply within {_REPLY_SECONDS} s, it may not be an MQTT broker")
         if self._is_back:
             self._is_back, self._source_state = False, ""
             self._publish(self._availability, "online", retain=True)
             for name in self._sent:
                 self._announce(name)
                 self._sent[name] = None, 0.0
-        ready, events = self._events.update(tracks), self._events.events
+        ready, events = self._events.update(frame.tracks), self._events.events
         if (source := "lost" if events.source_lost else "online") != self._source_state:
             self._source_state = source
             self._publish(self._source, source, retain=True)
@@ -112,7 +108,7 @@ class MqttSink:
                 self._announce(track.object)
             status = events.status(track.object) or {}
             last, due = self._sent.get(track.object, (None, now))
-            if status != last or (tracks and now >= due):
+            if status != last or (frame.tracks and now >= due):
                 self._sent[track.object] = status, now + 1 / self._options.rate
                 state = {**track.to_dict(), **status, "sent": time.time()}
                 if self._is_away:
@@ -122,6 +118,10 @@ class MqttSink:
         for name in [name for name in self._sent if events.status(name) is None]:
             self._announce(name, ended=True)
             self._remove(name)
+
+    def idle(self) -> None:
+        """Publish the events that have waited for a picture, and whether the source is lost."""
+        self.write(TrackedFrame(()))
 
     def end(self) -> None:
         """Publish the last events, and that this program is offline."""
@@ -188,12 +188,6 @@ class MqttSink:
             }
             topic = f"homeassistant/binary_sensor/catstream/{number}/config"
             self._publish(topic, b"" if ended else json.dumps(config), retain=True)
-
-    def _check_link(self) -> None:
-        if self._link is _Link.CONNECTED:
-            self._warnings.working()
-        elif self._link is _Link.CONNECTING and time.monotonic() - self._attempted > _REPLY_SECONDS:
-            self._warnings.failed(f"no reply within {_REPLY_SECONDS} s, it may not be an MQTT broker")
 
     # Called by paho, in its thread.
 
