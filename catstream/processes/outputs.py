@@ -19,7 +19,7 @@ from catstream.wire.endpoint import Endpoint
 from catstream.wire.newest import Publisher
 from catstream.wire.results import ResultsSender
 
-_LOOK_SECONDS = 0.002  # from one look at what the owner of the run has read to the next
+_LOOK_SECONDS = 0.002  # polling interval of the messages that the owner of the run has read
 _FEATURES_END_SECONDS = 10.0  # limit for the end to be stored, once the process was asked to end
 _RESULTS_END_SECONDS = 0.5  # the same for the owner of the run to receive the end
 _PREVIEW_SECONDS = 0.1  # shortest time between two pictures for subscribers
@@ -32,9 +32,9 @@ class Outputs(AbstractContextManager["Outputs"]):
     """The sockets that a detector sends on; a context manager.
 
     Backpressure: `send` blocks while `run.unstored_frames` messages are not stored by the compressor, or not read by
-    the owner of the run. It never waits for subscribers.
+    the owner of the run. Subscribers never block it.
 
-    turn     called repeatedly during a wait
+    turn     called repeatedly while it blocks
     replied  called after each reply of the compressor, such as `TrainingLag.reply`
     """
 
@@ -133,7 +133,7 @@ class Previews(Publisher[Preview]):
         return frames if frames and frames[0].time == time else []
 
     def turn(self) -> None:
-        """Send a preview if one is due; call it in every turn, even if no frame arrives, as subscribers may join."""
+        """Send a preview if one is due; call it in every iteration, even without a frame, as subscribers may join."""
         self.serve_late_joiners()
         if not self.has_subscribers:
             self._frames.clear()

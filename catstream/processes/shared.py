@@ -9,16 +9,16 @@ import ctypes
 import mmap
 import os
 
-RUNNING_SECONDS = 10.0  #: without a turn of its loop, after which a process counts as stuck
+RUNNING_SECONDS = 10.0  #: without an iteration of its loop, after which a process counts as stuck
 LONG_SECONDS = 120.0  #: the same for a start, and for a step that takes long and was announced
 
 
 class Watchdog(ctypes.Structure):
-    """Counts the turns of the loop of a process. The count stops with the loop, even if other threads continue.
+    """Counts the iterations of the loop of a process, which stop with the loop even if other threads continue.
 
-    turns     number of turns of the loop so far
-    patience  seconds that the present turn may take
-    limit     seconds that a turn may take that was not announced
+    turns     number of iterations so far
+    patience  seconds that the current iteration may take
+    limit     seconds that an iteration may take without announcement
     """
 
     _fields_ = (("turns", ctypes.c_double), ("patience", ctypes.c_double))
@@ -27,19 +27,19 @@ class Watchdog(ctypes.Structure):
     limit = RUNNING_SECONDS
 
     def beat(self) -> None:
-        """Count a turn of the loop."""
+        """Count an iteration."""
         self.allow(self.limit)
 
     def allow(self, seconds: float = LONG_SECONDS) -> None:
-        """Announce that the present turn takes long."""
+        """Announce that the current iteration takes long."""
         self.patience = seconds
         self.turns += 1
 
 
 class Owner(ctypes.Structure):
-    """The owner of the run: the frames that it has, as a detector is not too far ahead of it, and has not written.
+    """The progress of the program that owns the run: the detector waits for its reads, and reports its write errors.
 
-    after        number of the last message that it had when the process was started
+    after        number of the last message that it had received when the process was started
     read         number of the last message that it has read, infinite once it has received the end
     not_written  frames that it could not write to its results
     trouble      why it cannot write them, UTF-8; empty if it can

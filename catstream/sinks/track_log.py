@@ -480,6 +480,8 @@ class RunFiles:
         origins = {place: log_origin if Path(place) == path else origin for place in self.places}
         with ExitStack() as stack:
             outputs = stack.enter_context(OpenFiles(origins, is_live=is_live(origin.head.source)))
+            for place in self.places:
+                outputs.write_to(place)
             # The other files are made again from the log.
             followers = [place for place in self.places if is_file(place) and Path(place) != path]
             for frame in log if log is not None and last is not None and followers else ():
@@ -508,10 +510,12 @@ class RunFiles:
 
 
 class OpenFiles(AbstractContextManager["OpenFiles"]):
-    """All destinations of a run while it goes on. VideoError if one cannot be written any more, or completed.
+    """All destinations of a run while it continues; each is opened by its first `write_to`.
 
-    If the source `is_live`, the run goes on instead: a frame that cannot be written is counted, and a destination that
-    could not be opened is tried again with each frame.
+    VideoError if one cannot be opened, written or completed.
+
+    If the source `is_live`, the run continues instead: a frame that cannot be written is counted, and a destination
+    that could not be opened is tried again with each frame.
 
     not_written  frames that at least one destination lacks, as it could not be written
     """
@@ -519,11 +523,7 @@ class OpenFiles(AbstractContextManager["OpenFiles"]):
     def __init__(self, origins: Mapping[str, Origin], *, is_live: bool) -> None:
         self._origins, self._is_live, self.not_written = origins, is_live, 0
         self._sinks: dict[str, Sink] = {}
-        self._warnings = Warnings("results")
-        with ExitStack() as self._stack:
-            for place in origins:
-                self.write_to(place)
-            self._stack = self._stack.pop_all()
+        self._warnings, self._stack = Warnings("results"), ExitStack()
 
     @property
     def missed(self) -> int:
