@@ -30,11 +30,10 @@ from catstream.errors import (
 from catstream.fleet.spec import StreamSpec
 from catstream.fleet.store import Claim, Store
 from catstream.jobs.saved_model import SavedModel
-from catstream.jobs.state import files, restore
+from catstream.jobs.state import DESIRED, files, restore
 from catstream.messages.kinds import StreamState, StreamStatus, Track
 from catstream.messages.storage import Metadata
 from catstream.pipeline import Pipeline
-from catstream.processes.decisions import DESIRED
 from catstream.sinks.destinations import Origin, TrackedFrame
 from catstream.sinks.events import check_zones
 from catstream.sinks.track_log import OpenFiles, RunFiles, is_log

@@ -27,7 +27,9 @@ from catstream.messages import storage
 #: Files of saved models: of one object without a name, or by name.
 Models = str | os.PathLike[str] | Mapping[str, str | os.PathLike[str]]
 
-_NAME = "job.safetensors"
+#: Name of the file of a job, in its folder.
+JOB = "job.safetensors"
+
 _ALL = slice(None)  # frames
 
 
@@ -158,8 +160,8 @@ class Job:
         values = {field.name: getattr(self, field.name) for field in fields(self)}
         metadata = msgspec.to_builtins(values | {"settings": self.settings.values()}, enc_hook=_plain)
         with writing(folder):
-            storage.write(folder / _NAME, {}, metadata)
-        return folder / _NAME
+            storage.write(folder / JOB, {}, metadata)
+        return folder / JOB
 
     @classmethod
     def load(cls, path: Path) -> Job:
@@ -168,7 +170,7 @@ class Job:
         ServiceError if there is no such file; ProtocolError or SettingsError if it is damaged, or was written by
         another version of catstream.
         """
-        file = path / _NAME if path.is_dir() else path
+        file = path / JOB if path.is_dir() else path
         if not file.is_file():
             raise ServiceError(f"{str(path)!r} contains no run: start one with --state {quote(str(path))}")
         metadata: dict[str, Any] = storage.read(file)[1]

@@ -27,7 +27,7 @@ from catstream.base.text import listed
 from catstream.compression.checkpoint_store import CheckpointStore
 from catstream.compression.compressor import Compressor
 from catstream.errors import CatstreamError, ObjectError, ServiceError
-from catstream.jobs.job import Job
+from catstream.jobs.job import JOB, Job
 from catstream.jobs.saved_model import SavedModel
 
 #: Folder of the checkpoints, in the folder of the state.
@@ -35,10 +35,11 @@ CHECKPOINTS = "trees"
 #: Folder of the saved models of searched objects, in the folder of the state.
 SEARCHED = "searched_models"
 
-_SMALL = ("job.safetensors", "desired_state.json")
-_NAMES = re.compile(
-    rf"job\.safetensors|desired_state\.json|{CHECKPOINTS}/[0-9]+\.safetensors|{SEARCHED}/[0-9a-f]+\.safetensors"
-)
+#: Name of the file of the desired state, in the folder of the state.
+DESIRED = "desired_state.json"
+
+_SMALL = (JOB, DESIRED)
+_LARGE = re.compile(rf"({CHECKPOINTS}/[0-9]+|{SEARCHED}/[0-9a-f]+)\.safetensors")
 _ATTEMPTS = 5  # to read a checkpoint that is replaced meanwhile
 
 _log = logging.getLogger(__name__)
@@ -46,7 +47,7 @@ _log = logging.getLogger(__name__)
 
 def contains_run(folder: Path) -> bool:
     """Return True if a folder contains a run that can be resumed, whether or not that is complete."""
-    return (folder / _SMALL[0]).exists()
+    return (folder / JOB).exists()
 
 
 def files_of_state(folder: Path) -> dict[str, Path]:
@@ -95,7 +96,7 @@ def restore(folder: Path, content: Mapping[str, bytes]) -> None:
     ServiceError if a name is not one that `files` returns, or a file cannot be written.
     """
     for name, data in content.items():
-        if not _NAMES.fullmatch(name):
+        if name not in _SMALL and not _LARGE.fullmatch(name):
             raise ServiceError(f"{name!r} is not a file of the state of a pipeline")
         with writing(folder):
             (folder / name).parent.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -115,7 +116,7 @@ def check_new(folder: Path) -> None:
     if contains_run(folder):
         hint = f"already contains a run: continue it (--resume {quote(str(folder))}), or use another folder"
     elif (folder / CHECKPOINTS).exists():
-        hint = f"contains a run without its {_SMALL[0]}, which cannot be continued: use another folder"
+        hint = f"contains a run without its {JOB}, which cannot be continued: use another folder"
     else:
         return
     raise ServiceError(f"{str(folder)!r} {hint}")

@@ -12,10 +12,10 @@ from catstream.detection.objects import Detectors
 from catstream.errors import CatstreamError, ProtocolError, ServiceError
 from catstream.jobs.job import Job
 from catstream.jobs.saved_model import SavedModel
-from catstream.jobs.state import SEARCHED
+from catstream.jobs.state import DESIRED, SEARCHED
 from catstream.messages.kinds import Answer, Command
 from catstream.processes.control_commands import STOPPED, answer, execute
-from catstream.processes.decisions import DESIRED, DesiredObject, DesiredState, Start
+from catstream.processes.decisions import DesiredObject, DesiredState, Start
 from catstream.processes.model_files import ModelFiles
 from catstream.processes.process import Process
 from catstream.wire.channels import CONTROL

@@ -18,9 +18,6 @@ from catstream.base.files import write_atomically
 from catstream.errors import ProtocolError
 from catstream.messages.kinds import DetectorState, Position
 
-#: Name of the file of the desired state, in the folder of the state.
-DESIRED = "desired_state.json"
-
 _MOST_SAMPLES = 65536  # changes of the newest samples that are remembered until they are due
 _SYNC_SECONDS = 60.0  # shortest time between two checkpoints that are forced to disk
 _SYNC_RATE = 0.3e6  # bytes per second that they write at most, on average
@@ -31,11 +28,11 @@ _REST = 9.0  # from one checkpoint to the next, times the duration of the last o
 class DesiredObject:
     """An object that is to be tracked.
 
-    box     the object in its first frame; the last box in the saved model if the object begins with one
-    begins  seq of the message of its first frame
-    model   name of the saved model that it begins with, see `catstream.processes.model_files`; empty without one
-    size    bytes of the saved model
-    version of the saved model
+    box      the object in its first frame; the last box in the saved model if the object begins with one
+    begins   seq of the message of its first frame
+    model    name of the saved model that it begins with, see `catstream.processes.model_files`; empty without one
+    size     bytes of the saved model
+    version  of the saved model
     """
 
     box: Box

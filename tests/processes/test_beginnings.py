@@ -10,10 +10,11 @@ from catstream.base.box import Box
 from catstream.detection.objects import Detectors
 from catstream.features.pyramid import Pyramid
 from catstream.jobs.job import Job
+from catstream.jobs.state import DESIRED
 from catstream.messages.kinds import Command
 from catstream.processes.beginnings import Beginnings
 from catstream.processes.commands import Commands
-from catstream.processes.decisions import DESIRED, DesiredObject, DesiredState, Start
+from catstream.processes.decisions import DesiredObject, DesiredState, Start
 from catstream.processes.outputs import Previews
 from catstream.processes.process import Process
 from catstream.video.frames import Frame
