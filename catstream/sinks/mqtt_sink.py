@@ -36,6 +36,7 @@ from catstream.sinks.remote import CLOSE_SECONDS, QUEUED, EventStream, Warnings,
 _LONGEST_PAUSE = 30  # seconds between two attempts to connect, from 1 on
 _KEEPALIVE = 30  # seconds without a message after which client and broker test whether the other one is there
 _REPLY_SECONDS = 10  # in which a broker accepts or refuses a connection
+_ACCEPT_SECONDS = 1.0  # limit for the messages before the last one to arrive
 _EXPIRE_SECONDS = 10  # without a state after which Home Assistant shows a sensor as unavailable, at least
 
 
@@ -131,6 +132,10 @@ class MqttSink:
         self._publish_events(self._events.close())
         for name in [*self._sent]:
             self._remove(name)
+        # Until the broker accepts the connection, paho sends new messages before those that it has queued.
+        limit = time.monotonic() + _ACCEPT_SECONDS
+        while self._acknowledged < self._published and self._link is not _Link.LOST and time.monotonic() < limit:
+            time.sleep(0.01)
         self._publish(self._availability, "offline", retain=True)
 
     def close(self) -> None:
