@@ -127,9 +127,14 @@ class AnnotatePage {
     this.loading = true;
     while (this.wanted) {
       this.wanted = false;
-      const { frame, state: { video } } = this, query = video ? `video=${video}` : "";
+      const { frame, sent, state: { video } } = this, query = video ? `video=${video}` : "";
       const answer = await fetch(`frames/${frame}?${query}`).then((response) => response.ok && response.json(), () => null);
       if (!answer || video !== this.state.video) continue;
+      if (this.stage.picture?.frame === frame && (this.edits.length || sent !== this.sent)) { // it may be older than a box that is shown
+        await this.sent;
+        this.wanted = true;
+        continue;
+      }
       const { size: [width, height], objects } = answer;
       this.boxes = objects;
       const shown = this.stage.picture?.frame === frame;
