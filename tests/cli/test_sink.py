@@ -117,7 +117,10 @@ def test_a_sink_that_starts_again_keeps_the_file_of_its_last_start(catstream, en
     file.write_text("of the last start\n")
     with Publisher(HEALTH, endpoint, "detector") as health:
         sink = catstream("sink", file, "--endpoint", endpoint)
-        until(lambda: len(list(tmp_path.glob("*.ndjson"))) == 2, lambda: health.send(Health("detector", time.time())))
+        until(
+            lambda: [one.stat().st_size > 0 for one in tmp_path.glob("*.ndjson")] == [True, True],
+            lambda: health.send(Health("detector", time.time())),
+        )
         sink.terminate()
         sink.communicate(timeout=150)
     old, new = sorted(tmp_path.glob("*.ndjson"))
