@@ -48,12 +48,13 @@ class VideoFile:
             self.container.close()
             raise VideoError(f"there is no video in {str(path)!r}: {EXPECTED}")
         self.stream.thread_type = "NONE"  # the processes of the pipeline already use the cores
-        # A stream without a container, as raw H.264, has no time stamps, but may state its rate.
         # An AVI has the times of decoding only, which the demuxer gives to pictures that are in another order.
-        self.is_avi = self.container.format.name == "avi"
-        self.has_times = not av.format.Flags(self.container.format.flags) & av.format.Flags.no_timestamps
+        self._is_avi = self.container.format.name == "avi"
+        # A stream without a container, as raw H.264, has no time stamps, but may state its rate.
+        has_times = not av.format.Flags(self.container.format.flags) & av.format.Flags.no_timestamps
         self.pixel_aspect = self.stream.sample_aspect_ratio or Fraction(1)
-        self.rate = float((self.has_times and self.stream.average_rate) or self.stream.guessed_rate or RATE)
+        self.rate = float((has_times and self.stream.average_rate) or self.stream.guessed_rate or RATE)
+        self._clock, self._end = FrameClock(self.rate, self.stream.time_base if has_times else None), 0.0
 
     def count(self) -> int | None:
         """Return the number of frames: index entries that hold pictures, or else packets."""
@@ -71,7 +72,8 @@ class VideoFile:
         """Yield the frames with these numbers, from the one at index `start` on."""
         shape, upright, rest = None, UprightConverter(), wanted[start:]
         with self.container:
-            for number, (time, frame) in enumerate(self.timed(self.decoded(self.packets()), wanted.stop)):
+            for number, frame in enumerate(self.decoded(self.packets())):
+                time = self.time(number, frame.pts, frame.dts)
                 if number in rest or (number in wanted and shape is None):
                     image = upright(frame)
                     if shape is None:
@@ -82,35 +84,29 @@ class VideoFile:
                     self.scaled += scaled is not image
                     if number in rest:
                         yield Frame(wanted.index(number), time, scaled)
+                if number + 1 >= wanted.stop:  # damage after the part must not be an error
+                    return
+            self.set_truncated()
 
-    def timed(self, frames: Iterable[VideoFrame], stop: int) -> Iterator[tuple[float, VideoFrame]]:
-        """Yield the decoded frames before number `stop`, each with its time in seconds."""
-        clock = FrameClock(self.rate, self.stream.time_base if self.has_times else None)
-        end = 0.0
-        for number, frame in enumerate(frames):
-            end = max(end, frame.time or 0.0)
-            yield clock.time(number, None if self.is_avi else frame.pts, frame.dts), frame
-            if number + 1 >= stop:  # damage after the part must not be an error
-                return
-        self.set_end(end)
+    def time(self, number: int, pts: int | None, dts: int | None) -> float:
+        """Return the time of frame `number`, the next one, in seconds, from its time stamps in ticks."""
+        self._end = max(self._end, float((pts or 0) * self.stream.time_base))
+        return self._clock.time(number, None if self._is_avi else pts, dts)
 
-    def set_end(self, seconds: float) -> None:
-        """Compare the time of the last frame with the end that the header states."""
-        if (missing := self._stated_end() - seconds) > _TRUNCATED_SECONDS:
-            self.truncated = round(missing)
-
-    def _stated_end(self) -> float:
-        """The time of the end that the header of a Matroska file states in seconds, else 0.
+    def set_truncated(self) -> None:
+        """Compare the time of the last frame with the end that the header of a Matroska file states.
 
         FFmpeg ends without an error where such a file is truncated. It does not for others, or estimates their
         durations from the available data.
         """
         if "matroska" not in self.container.format.name:
-            return 0.0
+            return
+        end = (self.container.duration or 0) / 1e6
         if tag := re.fullmatch(r"(\d+):(\d+):([\d.]+)", self.stream.metadata.get("DURATION", "")):  # without the sound
             hours, minutes, seconds = map(float, tag.groups())
-            return 3600 * hours + 60 * minutes + seconds
-        return (self.container.duration or 0) / 1e6
+            end = 3600 * hours + 60 * minutes + seconds
+        if end - self._end > _TRUNCATED_SECONDS:
+            self.truncated = round(end - self._end)
 
     def decoded(
         self, packets: Iterable[Packet[Any] | str | None], is_before: Callable[[VideoFrame], bool] = lambda _: False

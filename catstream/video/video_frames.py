@@ -29,7 +29,6 @@ from catstream.errors import VideoError
 from catstream.video.frames import UprightConverter
 from catstream.video.images import of_one_size
 from catstream.video.source import ALL_FRAMES, FileSource, Images, counters_of, open_source
-from catstream.video.times import FrameClock
 from catstream.video.video_file import VideoFile
 
 if TYPE_CHECKING:
@@ -49,6 +48,7 @@ _SKIPPABLE = ("h264", "mpeg2video", "mpeg4")
 _CACHE_BYTES = 32 << 20  #: of decoded frames, in the pixel format of the video
 _NO_STAMP = -(1 << 63)
 _ATTEMPTS = 5  #: seeks to earlier and earlier keyframes, and packets after each, until one is known
+_COLUMNS = 6  #: of `_row`
 _INTERVAL = 256  #: packets between two calls of a `Progress`
 
 
@@ -56,71 +56,44 @@ _INTERVAL = 256  #: packets between two calls of a `Progress`
 class _Index:
     """The frames of a video file in order, and its packets in theirs.
 
-    times      float64 (frames,), seconds
-    packets    int (frames,), number of the packet of each frame; -1 if the decoder does not state it
-    identities int (packets, 3), of each packet its place in the file, time stamp of presentation in ticks, and size
-    keys       int, numbers of the packets that are keyframes
+    times    float64 (frames,), seconds
+    packets  int (frames,), number of the packet of each frame; -1 if the decoder does not state it
+    rows     int (packets, 6), see `_row`
     """
 
     times: Float64
     packets: np.ndarray
-    identities: np.ndarray
-    keys: np.ndarray
+    rows: np.ndarray
 
     @cached_property
     def is_unique(self) -> bool:
-        """Whether the number of its packet tells each frame."""
+        """Whether the number of its packet identifies each frame; if not, frames are counted from the first one."""
         return bool((self.packets >= 0).all()) and len(np.unique(self.packets)) == len(self.packets)
 
     @cached_property
     def numbers(self) -> np.ndarray:
         """The number of the frame of each packet, -1 without one."""
-        numbers = np.full(len(self.identities), -1)
+        numbers = np.full(len(self.rows), -1)
         numbers[self.packets] = np.arange(len(self.packets))
         return numbers
 
     @cached_property
     def starts(self) -> list[tuple[int, int]]:
         """First frame and packet of each part that can be decoded alone: keyframes which follow all frames before."""
-        starts = [(0, 0)]
-        for key in self.keys if self.is_unique else ():
+        starts, keys, end = [(0, 0)], np.flatnonzero(self.rows[:, 3]), len(self.rows)
+        # Around damage, which is noticed late, the picture of a keyframe may depend on earlier ones.
+        damaged = np.r_[0, self.rows[:, 5]][[0, *keys, end, end]]
+        for key in keys[damaged[:-3] == damaged[3:]] if self.is_unique else ():
             if (number := self.numbers[key]) > starts[-1][0]:
                 starts.append((int(number), int(key)))
         return starts
 
-    def find(self, packet: Packet[Any]) -> int | None:
-        """The number of a packet that is read after a seek; None if it is not certain."""
-        found = np.flatnonzero((self.identities == _identity(packet)).all(axis=1))
-        return int(found[0]) if len(found) == 1 else None
 
-
-def _identity(packet: Packet[Any]) -> tuple[int, int, int]:
+def _row(packet: Packet[Any], damaged: int = 0) -> tuple[int, ...]:
+    """Place of a packet in the file, time stamp of presentation in ticks, size, whether it is a keyframe, whether its
+    frame is discarded, and the number of damaged packets before it."""
     position, stamp = (_NO_STAMP if value is None else value for value in (packet.pos, packet.pts))
-    return position, stamp, packet.size
-
-
-class _Packets:
-    """Collects the columns of an index while the packets of a file are read."""
-
-    def __init__(self) -> None:
-        self.identities = array("q")
-        self.keys, self.discarded = array("b"), array("b")
-        self.damages = array("q")  # numbers of the packets at which damage was noticed, once for each lost frame
-
-    def __len__(self) -> int:
-        return len(self.keys)
-
-    def append(self, packet: Packet[Any]) -> None:
-        self.identities.extend(_identity(packet))
-        self.keys.append(packet.is_keyframe)
-        self.discarded.append(packet.is_discard)
-
-    def index(self, times: array[float], packets: np.ndarray | array[int]) -> _Index:
-        keys = np.flatnonzero(np.array(self.keys))
-        # Around damage, which is noticed late, the picture of a keyframe may depend on earlier ones.
-        noticed = np.searchsorted(np.array(self.damages), [0, *keys, len(self), len(self)])
-        keys = keys[noticed[:-3] == noticed[3:]]
-        return _Index(np.array(times), np.array(packets), np.array(self.identities).reshape(-1, 3), keys)
+    return position, stamp, packet.size, packet.is_keyframe, packet.is_discard, damaged
 
 
 class VideoFrames:
@@ -209,33 +182,31 @@ class VideoFrames:
 
     def _scan_packets(self, path: Path, progress: Progress) -> bool:
         """Number the frames by the time stamps of the packets; return False if that is not certain."""
-        video, packets = VideoFile(path, self.settings), _Packets()
+        video, rows = VideoFile(path, self.settings), array("q")
         containers, codec = video.container.format.name.split(","), video.stream.codec_context.codec.canonical_name
         with video.container:
             if codec not in _CODECS or not set(containers) & set(_CONTAINERS):
                 return False
-            for packet in video.packets():
+            for number, packet in enumerate(video.packets(), 1):
                 if isinstance(packet, str):
                     return False
                 if packet is not None:
-                    packets.append(packet)
-                    if len(packets) % _INTERVAL == 0:
-                        progress(len(packets), None)
-            time_base = video.stream.time_base
-            video.set_end(float(max(packets.identities[1::3]) * time_base))
-        stamps = np.array(packets.identities[1::3])
-        shown, keys = np.array(packets.discarded) == 0, np.array(packets.keys) == 1
-        ordered = np.flatnonzero(shown)[stamps[shown].argsort(kind="stable")]
-        # A frame is between the keyframes around its own: time stamps do not begin again, and none leads the first one.
-        limits, group = stamps[keys], keys.cumsum() - 1
-        low, high = np.r_[limits[:1], limits[:-1]], np.r_[limits[1:], sys.maxsize]
-        if not (keys[:1].all() and (np.diff(stamps[ordered]) > 0).all() and stamps.min() != _NO_STAMP):
-            return False
-        if not ((low[group] <= stamps) & (stamps < high[group]))[shown].all():
-            return False
-        clock = FrameClock(video.rate, time_base)
-        times = array("d", [clock.time(number, stamp, None) for number, stamp in enumerate(stamps[ordered].tolist())])
-        self._publish(packets.index(times, ordered), counters_of(video))
+                    rows.extend(_row(packet))
+                    if number % _INTERVAL == 0:
+                        progress(number, None)
+            _, stamps, _, keys, discarded, _ = np.array(rows).reshape(-1, _COLUMNS).T
+            shown, keys = discarded == 0, keys == 1
+            ordered = np.flatnonzero(shown)[stamps[shown].argsort(kind="stable")]
+            # A frame is between the keyframes around its own: stamps do not begin again, and none leads the first one.
+            limits, group = stamps[keys], keys.cumsum() - 1
+            low, high = np.r_[limits[:1], limits[:-1]], np.r_[limits[1:], sys.maxsize]
+            if not (keys[:1].all() and (np.diff(stamps[ordered]) > 0).all() and stamps.min() != _NO_STAMP):
+                return False
+            if not ((low[group] <= stamps) & (stamps < high[group]))[shown].all():
+                return False
+            times = [video.time(number, stamp, None) for number, stamp in enumerate(stamps[ordered].tolist())]
+            video.set_truncated()
+        self._publish(video, times, ordered, rows)
         with suppress(VideoError):
             self[min(_VERIFIED, len(self) - 1)]
             return True
@@ -243,51 +214,47 @@ class VideoFrames:
 
     def _decode_all(self, path: Path, progress: Progress) -> None:
         """Number the frames that FFmpeg decodes: a frame has the time stamp of its packet, which is its number here."""
-        video, packets, stop = VideoFile(path, self.settings), _Packets(), range(sys.maxsize)[self._part].stop
-        times, packet_numbers, upright = array("d"), array("q"), UprightConverter()
-        total = video.count()
-        total = total and len(range(total)[self._part])
+        video, stop, total = VideoFile(path, self.settings), range(sys.maxsize)[self._part].stop, None
+        times, packets, rows, upright = array("d"), array("q"), array("q"), UprightConverter()
+        if count := video.count():
+            total = len(range(count)[self._part])
 
         def numbered() -> Iterator[Packet[Any] | str | None]:
             for packet in video.packets():
                 if packet is not None and not isinstance(packet, str):
-                    packets.append(packet)
-                    packet.pts = len(packets) - 1
+                    rows.extend(_row(packet, video.damaged))
+                    packet.pts = len(rows) // _COLUMNS - 1
                 yield packet
-                packets.damages.extend([len(packets)] * (video.damaged - len(packets.damages)))
-
-        def decoded() -> Iterator[VideoFrame]:
-            for frame in video.decoded(numbered()):
-                number = -1 if frame.pts is None else frame.pts
-                packet_numbers.append(number)
-                stamp = packets.identities[3 * number + 1]
-                frame.pts = None if number < 0 or stamp == _NO_STAMP else stamp
-                yield frame
-
-        def publish(*, exact: bool = False) -> None:
-            self._publish(packets.index(times, packet_numbers[: len(times)]), counters_of(video), exact=exact)
 
         first: tuple[int, int] | None = None
         with video.container:
             try:
-                for time, frame in video.timed(decoded(), stop):
+                for frame in video.decoded(numbered()):
+                    number = -1 if frame.pts is None else frame.pts
+                    stamp = rows[number * _COLUMNS + 1] if number >= 0 else _NO_STAMP
+                    time = video.time(len(times), None if stamp == _NO_STAMP else stamp, frame.dts)
                     first = first or (frame.width, frame.height)
                     if (frame.width, frame.height) != first:
-                        width, height = self.size
-                        of_one_size(upright(frame), (height, width, 3), self.settings.resize, path, len(times))
+                        shape = self.size[1], self.size[0], 3
+                        of_one_size(upright(frame), shape, self.settings.resize, path, len(times))
                         video.scaled += 1
                     times.append(time)
+                    packets.append(number)
                     if len(times) % _INTERVAL == 0 and len(times) > 1.5 * len(self):
-                        publish()
+                        self._publish(video, times, packets, rows)
                     progress(len(times), total)
+                    if len(times) >= stop:
+                        break
+                else:
+                    video.set_truncated()
             finally:
-                publish(exact=True)
+                self._publish(video, times, packets, rows, exact=True)
 
-    def _publish(self, index: _Index, counters: dict[str, float], *, exact: bool = False) -> None:
+    def _publish(self, video: VideoFile, times: Any, packets: Any, rows: array[int], *, exact: bool = False) -> None:
         with self._lock:
             self.close()
-            self._index, self.is_exact, self.counters = index, exact, counters
-            self.times = index.times[self._part]
+            self._index = _Index(np.array(times), np.array(packets), np.array(rows).reshape(-1, _COLUMNS))
+            self.times, self.is_exact, self.counters = self._index.times[self._part], exact, counters_of(video)
 
 
 class _Reader:
@@ -331,7 +298,7 @@ class _Reader:
         begin, problem = max(starts[place][0], number - self._capacity + 1), None
         # A decoder may need more than one keyframe before its pictures are complete.
         for attempt in dict.fromkeys(max(0, place - back) for back in (0, 1, 2, place if self._is_exact else 0)):
-            self._run, self._next = self._frames(starts[attempt][1], begin), begin
+            self._run, self._next = self._frames(attempt, begin), begin
             try:
                 if self._advance(number):
                     return
@@ -352,58 +319,59 @@ class _Reader:
                 return True
         return False
 
-    def _frames(self, first: int, begin: int) -> Iterator[tuple[int, VideoFrame]]:
-        """Decode from packet `first` on; yield the frames from number `begin` on.
+    def _frames(self, place: int, begin: int) -> Iterator[tuple[int, VideoFrame]]:
+        """Decode from one of the starts on; yield the frames from number `begin` on.
 
-        The time stamp of a packet, which its frame inherits, is replaced by its number. Frames before `begin` are not
-        decoded if no other one refers to them.
+        The time stamp of a packet, which its frame inherits, is replaced by its number.
         """
-        index = self._index
-        start, packets = self._seek(first)
+        index, first = self._index, self._index.starts[place][1]
+        number, packets = self._seek(place)
         context = self._video.stream.codec_context
         context.flush_buffers()
         skips = context.codec.name in _SKIPPABLE and index.is_unique and not self._settings.skip_damaged
 
         def numbered() -> Iterator[Packet[Any] | str | None]:
-            number = start
+            following = number
             for packet in packets:
-                if packet is not None and not isinstance(packet, str):
-                    if number >= first:
-                        if skips:
-                            context.skip_frame = "NONREF" if 0 <= index.numbers[number] < begin else "DEFAULT"
-                        packet.pts = number
+                if packet is None or isinstance(packet, str):
+                    if following > first:
                         yield packet
-                    number += 1
-                    if number == len(index.identities):
-                        break
-                elif number > first:
+                    continue
+                if following >= first:
+                    if skips:  # frames before `begin` to which no other one refers
+                        context.skip_frame = "NONREF" if 0 <= index.numbers[following] < begin else "DEFAULT"
+                    packet.pts = following
                     yield packet
+                following += 1
+                if following == len(index.rows):
+                    break
             yield None
 
-        if index.is_unique:
-            for frame in self._video.decoded(numbered(), lambda frame: bool(index.numbers[frame.pts] < begin)):
-                yield int(index.numbers[frame.pts]), frame
-        else:
-            for number, frame in enumerate(self._video.decoded(numbered())):
-                if number >= begin:
-                    yield number, frame
+        def is_before(frame: VideoFrame) -> bool:
+            return index.is_unique and bool(index.numbers[frame.pts] < begin)
 
-    def _seek(self, first: int) -> tuple[int, Iterator[Packet[Any] | str | None]]:
-        """Return the number of a packet at or before number `first`, and an iterator of the packets from it on.
+        for count, frame in enumerate(self._video.decoded(numbered(), is_before)):
+            current = int(index.numbers[frame.pts]) if index.is_unique else count
+            if current >= begin:
+                yield current, frame
+
+    def _seek(self, place: int) -> tuple[int, Iterator[Packet[Any] | str | None]]:
+        """Return the number of a packet at or before a start, and an iterator of the packets from it on.
 
         Where a container seeks to is known by the packets that it then has. If that fails, the file is opened again.
         """
         import av
 
-        before = int(np.searchsorted(self._index.keys, first, "right")) if first else 0
-        for key in self._index.keys[:before][::-1][:_ATTEMPTS]:
+        rows, starts = self._index.rows, self._index.starts
+        for _, key in starts[place : max(0, place - _ATTEMPTS) : -1]:
             with suppress(av.FFmpegError):
-                self._video.container.seek(int(self._index.identities[key, 1]), stream=self._video.stream)
+                self._video.container.seek(int(rows[key, 1]), stream=self._video.stream)
                 packets = self._video.packets()
                 for packet in islice(packets, _ATTEMPTS):
-                    number = None if packet is None or isinstance(packet, str) else self._index.find(packet)
-                    if number is not None and number <= first:
-                        return number, chain([packet], packets)
+                    if packet is not None and not isinstance(packet, str):
+                        found = np.flatnonzero((rows[:, :3] == _row(packet)[:3]).all(axis=1))
+                        if len(found) == 1 and found[0] <= starts[place][1]:
+                            return int(found[0]), chain([packet], packets)
         self._video.container.close()
         self._video = self._opened()
         return 0, self._video.packets()
