@@ -131,7 +131,7 @@ class Annotation:
         self._workers = Workers(self._jobs)
         self._folder = tempfile.TemporaryDirectory(prefix="catstream-annotate-", ignore_cleanup_errors=True)
         try:
-            self.frames = self._open(os.fspath(video), part)
+            self.frames = VideoFrames(os.fspath(video), part, self.settings.run)
             self._is_scanned = False
             self.set_boxes(boxes)
         except BaseException:
@@ -300,9 +300,6 @@ class Annotation:
         """
         unchecked = (stretch for stretch in self._stretches() if not self._is_checked(stretch))
         return sorted(map(self._next_in, unchecked), key=lambda frame: -frame.errors)
-
-    def _open(self, video: str, part: slice) -> VideoFrames:
-        return VideoFrames(video, part, self.settings.run)
 
     def _check(self, keyframes: Mapping[str, Mapping[int, KeyframeBox]]) -> None:
         """Raise BoxError if a box is not in its frame, or a keyframe not in the video, as soon as that is known."""

@@ -3,63 +3,52 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
 
 from catstream.annotation.keyframes import HIDDEN, KeyframeBox
 from catstream.annotation.passes import box_of
 from catstream.base.arrays import Bool, Float64
-from catstream.messages.kinds import Check, Track
+from catstream.messages.kinds import Check, State, Track
 
 #: Probability from which a frame is checked.
 CHECKED = 0.97
 
 
+@dataclass(frozen=True, eq=False)
 class ObjectTracks:
-    """The tracks of an object by frame, in arrays: each `Track` is made when it is read.
+    """The tracks of an object by frame, in arrays: each `Track` is made when it is read."""
 
-    Attributes
-    ----------
-    unchecked : bool (frames,)
-    """
+    name: str
+    keyframes: dict[int, KeyframeBox]
+    times: Float64
+    boxes: Float64
+    probabilities: Float64
+    scores: Float64
 
-    def __init__(
-        self,
-        name: str,
-        keyframes: dict[int, KeyframeBox],
-        times: Float64,
-        boxes: Float64,
-        probabilities: Float64,
-        scores: Float64,
-    ) -> None:
-        self._name, self._keyframes, self._times = name, keyframes, times
-        self._boxes, self._probabilities, self._scores = boxes, probabilities, scores
-        self.unchecked: Bool = probabilities < CHECKED
-        self.unchecked[[*keyframes]] = False
+    @cached_property
+    def unchecked(self) -> Bool:
+        """Whether each frame is unchecked, bool (frames,)."""
+        unchecked = self.probabilities < CHECKED
+        unchecked[[*self.keyframes]] = False
+        return unchecked
 
     def __len__(self) -> int:
-        return len(self._times)
+        return len(self.times)
 
     def __iter__(self) -> Iterator[Track]:
         return map(self.__getitem__, range(len(self)))
 
     def __getitem__(self, frame: int) -> Track:
         frame = range(len(self))[frame]
-        box, probability = box_of(self._boxes[frame]), float(self._probabilities[frame])
+        box, chance, check = box_of(self.boxes[frame]), float(self.probabilities[frame]), self.check(frame)
+        state: State = "absent" if box is None else "present"
+        track = frame, float(self.times[frame]), state, box, float(self.scores[frame])
         return Track(
-            *(
-                frame,
-                float(self._times[frame]),
-                "absent" if box is None else "present",
-                box,
-                float(self._scores[frame]),
-            ),
-            model_version=0,
-            object=self._name,
-            doubtful=probability < CHECKED,
-            checked=self.check(frame),
-            probability=probability,
+            *track, model_version=0, object=self.name, doubtful=chance < CHECKED, checked=check, probability=chance
         )
 
     def check(self, frame: int) -> Check:
-        if frame in self._keyframes:
-            return HIDDEN if self._keyframes[frame] == HIDDEN else "keyframe"
+        if frame in self.keyframes:
+            return HIDDEN if self.keyframes[frame] == HIDDEN else "keyframe"
         return "unchecked" if self.unchecked[frame] else "checked"
