@@ -238,30 +238,20 @@ class Images:
         numbers = range(self.count())[numbers.start : numbers.stop : numbers.step]
         resize = self.settings.resize
         # The first image of the run sets the size, even if the run is resumed.
-        shape = self._read(numbers[0]).shape if resize and start and numbers else None
+        shape = self.image(numbers[0]).shape if resize and start and numbers else None
         for index, number in enumerate(numbers[start:], start):
-            image = self._read(number)
+            image = self.image(number, shape)
             shape = shape or image.shape
-            yield Frame(index, number / self.rate, self._in_shape(image, shape, number))
+            yield Frame(index, number / self.rate, image)
 
-    def image(self, number: int, shape: tuple[int, ...]) -> np.ndarray:
-        """Return an image by its number, scaled to the shape of the first one as `frames` does."""
-        return self._in_shape(self._read(number), shape, number)
-
-    def _in_shape(self, image: np.ndarray, shape: tuple[int, ...], number: int) -> np.ndarray:
-        scaled = of_one_size(image, shape, self.settings.resize, self._path(number), number)
+    def image(self, number: int, shape: tuple[int, ...] | None = None) -> np.ndarray:
+        """Return an image by its number, scaled to the shape of the first one if that is passed."""
+        path, image = self._read_image.pages[number][0], self._read_image(number)
+        if image is None:
+            raise VideoError(f"cannot read the image {str(path)!r} (frame {number}): replace or remove it")
+        scaled = of_one_size(image, shape or image.shape, self.settings.resize, path, number)
         self.scaled += scaled is not image
         return scaled
-
-    def _path(self, number: int) -> Path:
-        return self._read_image.pages[number][0]
-
-    def _read(self, number: int) -> np.ndarray:
-        image = self._read_image(number)
-        if image is None:
-            name = str(self._path(number))
-            raise VideoError(f"cannot read the image {name!r} (frame {number}): replace or remove it")
-        return image
 
 
 def prepare() -> None:
