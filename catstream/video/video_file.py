@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import re
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from collections.abc import Generator, Iterable, Iterator, Sequence
 from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -34,7 +34,7 @@ class VideoFile:
 
     images: Sequence[Path] = ()
 
-    def __init__(self, path: Path, settings: RunSettings) -> None:
+    def __init__(self, path: Path, settings: RunSettings, thread_type: str = "NONE") -> None:
         import av  # imported here because it takes 0.1 s and folders do not need it
 
         self.path, self.settings, self.damaged, self.scaled, self.truncated = path, settings, 0, 0, 0
@@ -47,7 +47,7 @@ class VideoFile:
         if self.stream is None or self.container.format.name == "tty":
             self.container.close()
             raise VideoError(f"there is no video in {str(path)!r}: {EXPECTED}")
-        self.stream.thread_type = "NONE"  # the processes of the pipeline already use the cores
+        self.stream.thread_type = thread_type  # the processes of the pipeline already use the cores
         # An AVI has the times of decoding only, which the demuxer gives to pictures that are in another order.
         self._is_avi = self.container.format.name == "avi"
         # A stream without a container, as raw H.264, has no time stamps, but may state its rate.
@@ -108,12 +108,10 @@ class VideoFile:
         if end - self._end > _TRUNCATED_SECONDS:
             self.truncated = round(end - self._end)
 
-    def decoded(
-        self, packets: Iterable[Packet[Any] | str | None], is_before: Callable[[VideoFrame], bool] = lambda _: False
-    ) -> Iterator[VideoFrame]:
+    def decoded(self, packets: Iterable[Packet[Any] | str | None], begin: int | None = None) -> Iterator[VideoFrame]:
         """Yield what FFmpeg decodes. At an error, raise VideoError, or continue at the next keyframe.
 
-        is_before : whether to drop a frame, damaged or not
+        begin : frames with an earlier time stamp are dropped, damaged or not
         """
         import av
 
@@ -136,7 +134,7 @@ class VideoFile:
                     frames = decoder.decode(None)
                 decoder.flush_buffers()
             for frame in frames:
-                if is_before(frame):
+                if begin is not None and (frame.pts or 0) < begin:
                     continue
                 is_spoilt = frame.is_corrupt or (is_spoilt and not frame.key_frame)
                 if is_spoilt and not skip:

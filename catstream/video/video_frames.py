@@ -200,9 +200,8 @@ class VideoFrames:
             # A frame is between the keyframes around its own: stamps do not begin again, and none leads the first one.
             limits, group = stamps[keys], keys.cumsum() - 1
             low, high = np.r_[limits[:1], limits[:-1]], np.r_[limits[1:], sys.maxsize]
-            if not (keys[:1].all() and (np.diff(stamps[ordered]) > 0).all() and stamps.min() != _NO_STAMP):
-                return False
-            if not ((low[group] <= stamps) & (stamps < high[group]))[shown].all():
+            is_certain = keys[:1].all() and (np.diff(stamps[ordered]) > 0).all() and stamps.min() != _NO_STAMP
+            if not (is_certain and ((low[group] <= stamps) & (stamps < high[group]))[shown].all()):
                 return False
             times = [video.time(number, stamp, None) for number, stamp in enumerate(stamps[ordered].tolist())]
             video.set_truncated()
@@ -262,8 +261,9 @@ class _Reader:
 
     def __init__(self, frames: VideoFrames, path: Path, index: _Index) -> None:
         self._path, self._index, self._settings, (width, height) = path, index, frames.settings, frames.size
-        self._shape, self._is_exact, self._is_threaded = (height, width, 3), frames.is_exact, frames.is_threaded
-        self._upright, self._video = UprightConverter(), self._opened()
+        self._shape, self._is_exact, self._upright = (height, width, 3), frames.is_exact, UprightConverter()
+        self._threads = "AUTO" if frames.is_threaded and not frames.settings.skip_damaged else "NONE"
+        self._video = VideoFile(path, frames.settings, self._threads)
         pixels = self._video.stream.codec_context.format
         bits = (pixels and pixels.padded_bits_per_pixel) or 24
         self._capacity = max(2, 8 * _CACHE_BYTES // (width * height * bits))
@@ -274,12 +274,6 @@ class _Reader:
     def close(self) -> None:
         self._run = iter(())  # it refers to this reader, whose memory would only be freed by a garbage collection
         self._video.container.close()
-
-    def _opened(self) -> VideoFile:
-        video = VideoFile(self._path, self._settings)
-        if self._is_threaded and not self._settings.skip_damaged:
-            video.stream.thread_type = "AUTO"
-        return video
 
     def image(self, number: int) -> UInt8:
         if number not in self._cache:
@@ -322,38 +316,32 @@ class _Reader:
     def _frames(self, place: int, begin: int) -> Iterator[tuple[int, VideoFrame]]:
         """Decode from one of the starts on; yield the frames from number `begin` on.
 
-        The time stamp of a packet, which its frame inherits, is replaced by its number.
+        The time stamp of a packet, which its frame inherits, is replaced by the number of the frame.
         """
         index, first = self._index, self._index.starts[place][1]
-        number, packets = self._seek(place)
+        start, packets = self._seek(place)
         context = self._video.stream.codec_context
         context.flush_buffers()
         skips = context.codec.name in _SKIPPABLE and index.is_unique and not self._settings.skip_damaged
 
         def numbered() -> Iterator[Packet[Any] | str | None]:
-            following = number
+            number = start
             for packet in packets:
-                if packet is None or isinstance(packet, str):
-                    if following > first:
-                        yield packet
-                    continue
-                if following >= first:
-                    if skips:  # frames before `begin` to which no other one refers
-                        context.skip_frame = "NONREF" if 0 <= index.numbers[following] < begin else "DEFAULT"
-                    packet.pts = following
-                    yield packet
-                following += 1
-                if following == len(index.rows):
+                if number == len(index.rows):
                     break
+                if packet is not None and not isinstance(packet, str):
+                    packet.pts = int(index.numbers[number])
+                    if skips:  # frames before `begin` to which no other one refers
+                        context.skip_frame = "NONREF" if 0 <= packet.pts < begin else "DEFAULT"
+                    number += 1
+                if number > first:
+                    yield packet
             yield None
 
-        def is_before(frame: VideoFrame) -> bool:
-            return index.is_unique and bool(index.numbers[frame.pts] < begin)
-
-        for count, frame in enumerate(self._video.decoded(numbered(), is_before)):
-            current = int(index.numbers[frame.pts]) if index.is_unique else count
-            if current >= begin:
-                yield current, frame
+        for count, frame in enumerate(self._video.decoded(numbered(), begin if index.is_unique else None)):
+            number = frame.pts or 0 if index.is_unique else count
+            if number >= begin:
+                yield number, frame
 
     def _seek(self, place: int) -> tuple[int, Iterator[Packet[Any] | str | None]]:
         """Return the number of a packet at or before a start, and an iterator of the packets from it on.
@@ -373,5 +361,5 @@ class _Reader:
                         if len(found) == 1 and found[0] <= starts[place][1]:
                             return int(found[0]), chain([packet], packets)
         self._video.container.close()
-        self._video = self._opened()
+        self._video = VideoFile(self._path, self._settings, self._threads)
         return 0, self._video.packets()
