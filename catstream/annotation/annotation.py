@@ -197,10 +197,8 @@ class Annotation:
             self.progress("reading", len(self.frames), None)
             try:
                 self.frames.scan(lambda *done: self.progress("reading", *done), exact=exact)
-            except VideoError:
-                raise
-            except BaseException:  # interrupted by `progress`
-                self._is_scanned = False
+            except BaseException as error:
+                self._is_scanned = isinstance(error, VideoError)  # if not, it was interrupted by `progress`
                 raise
         self._check(self.keyframes)
 

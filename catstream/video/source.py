@@ -236,9 +236,8 @@ class Images:
     def frames(self, numbers: range, start: int) -> Generator[Frame]:
         """Yield the frames with these numbers, from index `start` on."""
         numbers = range(self.count())[numbers.start : numbers.stop : numbers.step]
-        resize = self.settings.resize
         # The first image of the run sets the size, even if the run is resumed.
-        shape = self.image(numbers[0]).shape if resize and start and numbers else None
+        shape = self.image(numbers[0]).shape if self.settings.resize and start and numbers else None
         for index, number in enumerate(numbers[start:], start):
             image = self.image(number, shape)
             shape = shape or image.shape
