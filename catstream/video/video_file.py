@@ -47,7 +47,7 @@ class VideoFile:
         if self.stream is None or self.container.format.name == "tty":
             self.container.close()
             raise VideoError(f"there is no video in {str(path)!r}: {EXPECTED}")
-        self.stream.thread_type = thread_type  # the processes of the pipeline already use the cores
+        self.stream.thread_type = thread_type  # "NONE": the processes of the pipeline already use the cores
         # An AVI has the times of decoding only, which the demuxer gives to pictures that are in another order.
         self._is_avi = self.container.format.name == "avi"
         # A stream without a container, as raw H.264, has no time stamps, but may state its rate.

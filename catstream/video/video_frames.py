@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from catstream.base.arrays import Float64, UInt8
+from catstream.base.arrays import UInt8
 from catstream.base.settings import RunSettings
 from catstream.base.text import counted
 from catstream.errors import VideoError
@@ -56,18 +56,16 @@ _INTERVAL = 256  #: packets between two calls of a `Progress`
 class _Index:
     """The frames of a video file in order, and its packets in theirs.
 
-    times    float64 (frames,), seconds
     packets  int (frames,), number of the packet of each frame; -1 if the decoder does not state it
     rows     int (packets, 6), see `_row`
     """
 
-    times: Float64
     packets: np.ndarray
     rows: np.ndarray
 
     @cached_property
     def is_unique(self) -> bool:
-        """Whether the number of its packet identifies each frame; if not, frames are counted from the first one."""
+        """Whether each frame has a packet of its own; if not, frames are counted from the first one."""
         return bool((self.packets >= 0).all()) and len(np.unique(self.packets)) == len(self.packets)
 
     @cached_property
@@ -252,8 +250,8 @@ class VideoFrames:
     def _publish(self, video: VideoFile, times: Any, packets: Any, rows: array[int], *, exact: bool = False) -> None:
         with self._lock:
             self.close()
-            self._index = _Index(np.array(times), np.array(packets), np.array(rows).reshape(-1, _COLUMNS))
-            self.times, self.is_exact, self.counters = self._index.times[self._part], exact, counters_of(video)
+            self._index = _Index(np.array(packets), np.array(rows).reshape(-1, _COLUMNS))
+            self.times, self.is_exact, self.counters = np.array(times)[self._part], exact, counters_of(video)
 
 
 class _Reader:
@@ -268,7 +266,7 @@ class _Reader:
         bits = (pixels and pixels.padded_bits_per_pixel) or 24
         self._capacity = max(2, 8 * _CACHE_BYTES // (width * height * bits))
         self._cache: dict[int, VideoFrame] = {}
-        self._run: Iterator[tuple[int, VideoFrame]] = iter(())
+        self._run: Iterator[int] = iter(())  # decodes frames into the cache, and yields their numbers
         self._next = 0  # number of the frame that follows in the run
 
     def close(self) -> None:
@@ -287,36 +285,24 @@ class _Reader:
         place = bisect_right(starts, number, key=itemgetter(0)) - 1
         if starts[place][0] <= self._next <= number:
             self._cache.clear()  # reading forwards needs none
-            if self._advance(number):
+            if number in self._run:
                 return
         begin, problem = max(starts[place][0], number - self._capacity + 1), None
         # A decoder may need more than one keyframe before its pictures are complete.
         for attempt in dict.fromkeys(max(0, place - back) for back in (0, 1, 2, place if self._is_exact else 0)):
-            self._run, self._next = self._frames(attempt, begin), begin
+            self._run, self._next = self._decode_from(attempt, begin), begin
             try:
-                if self._advance(number):
+                if number in self._run:
                     return
             except VideoError as error:
                 problem = error
         raise problem or VideoError(f"frame {number} of {str(self._path)!r} cannot be decoded")
 
-    def _advance(self, number: int) -> bool:
-        """Read the run until it has returned a frame; return False if one is missing."""
-        for current, frame in self._run:
-            if current != self._next:
-                return False
-            while len(self._cache) >= self._capacity:
-                del self._cache[next(iter(self._cache))]  # the oldest one
-            self._cache[current] = frame
-            self._next += 1
-            if current == number:
-                return True
-        return False
+    def _decode_from(self, place: int, begin: int) -> Iterator[int]:
+        """Decode from one of the starts on, put the frames from number `begin` on into the cache, yield their numbers.
 
-    def _frames(self, place: int, begin: int) -> Iterator[tuple[int, VideoFrame]]:
-        """Decode from one of the starts on; yield the frames from number `begin` on.
-
-        The time stamp of a packet, which its frame inherits, is replaced by the number of the frame.
+        The time stamp of a packet, which its frame inherits, is replaced by the number of the frame. The iterator ends
+        before the first frame that is missing.
         """
         index, first = self._index, self._index.starts[place][1]
         start, packets = self._seek(place)
@@ -340,8 +326,15 @@ class _Reader:
 
         for count, frame in enumerate(self._video.decoded(numbered(), begin if index.is_unique else None)):
             number = frame.pts or 0 if index.is_unique else count
-            if number >= begin:
-                yield number, frame
+            if number < begin:
+                continue
+            if number != self._next:
+                return
+            while len(self._cache) >= self._capacity:
+                del self._cache[next(iter(self._cache))]  # the oldest one
+            self._cache[number] = frame
+            self._next += 1
+            yield number
 
     def _seek(self, place: int) -> tuple[int, Iterator[Packet[Any] | str | None]]:
         """Return the number of a packet at or before a start, and an iterator of the packets from it on.
