@@ -32,7 +32,6 @@ from catstream.video.video_frames import VideoFrames
 #: The boxes of an object at its keyframes, by number of the frame; None where it is absent.
 Keyframes = Mapping[int, Box | None]
 
-
 _TRIMMED = 32  #: frames after which the memory of searches of whole frames is returned
 
 _NEAR = 0.4  #: IoU with the box of a keyframe, above which a pass has not lost the object there
@@ -119,7 +118,7 @@ def run_pass(
     like all around it.
 
     models : folder for the models of the boxes
-    count : file to which a byte is appended for each frame; if it is deleted, the pass ends with an OSError
+    count : file whose size is set to the number of frames so far; if it is deleted, the pass ends with an OSError
     """
     box, others = keyframes[start], {number: box for number, box in keyframes.items() if number != start}
     learned = _memory(frames, others, settings, models) if use_memory else None
@@ -136,11 +135,9 @@ def run_pass(
 
 
 def _images(frames: VideoFrames, numbers: Iterable[int], count: Path | None) -> Iterator[np.ndarray]:
-    for number in numbers:
+    for done, number in enumerate(numbers, 1):
         if count is not None:
-            file = os.open(count, os.O_WRONLY | os.O_APPEND)
-            os.write(file, b".")
-            os.close(file)
+            os.truncate(count, done)
         if number % _TRIMMED == 0:
             release_memory()
         yield frames[number]
