@@ -53,7 +53,7 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
         behind.append(newest(out) - CheckpointStore(kept / CHECKPOINTS).position()[1])
     seconds.append(watched(["--resume", str(kept)], out, rest if options.live else None))
 
-    log = [*Log(next(out.glob("*.csv"))).frames()]
+    log = [*Log(next(out.glob("*.csv")))]
     rows = [(track.frame, track.object) for frame in log for track in frame.tracks]
     frames = max(track + 1 for track, _ in rows) if options.live else frames
     lost, twice = frames * len(boxes) - len(set(rows)), len(rows) - len(set(rows))
