@@ -53,6 +53,10 @@ class HostPortType(click.ParamType):  # type: ignore[type-arg]  # generic since 
         return HostPort(host.removeprefix("[").removesuffix("]") or "127.0.0.1", int(port), attempts)
 
 
+#: In the place of a token: every user of this machine may use the page.
+_OPEN = "none"
+
+
 def _token_of_user() -> str:
     """The token of this user, which is made once, so that links stay valid; a new one if it cannot be kept."""
     token = secrets.token_hex(16)
@@ -71,7 +75,7 @@ def _token_of_user() -> str:
 def token_of_page() -> str | None:
     """Return the variable VIEW_TOKEN, or else the token of the user; None for "none"."""
     token = os.environ.get("VIEW_TOKEN") or _token_of_user()
-    return None if token == "none" else token
+    return None if token == _OPEN else token
 
 
 def server_of(site: Site | Wall | AnnotationSite, listen: HostPort) -> Server:
