@@ -116,12 +116,13 @@ class VideoFrames:
     def __init__(self, text: str | Path, part: slice = ALL_FRAMES, settings: RunSettings | None = None) -> None:
         self.settings, self._part = settings or RunSettings(), part
         with open_source(text, part=part, settings=self.settings) as source:
-            assert isinstance(source, FileSource)
+            if not isinstance(source, FileSource):
+                raise VideoError(f"{str(text)!r} is a live source: expected a video file, or a folder of images")
             first = next(source)
             self._source = source.reader if isinstance(source.reader, Images) else source.reader.path
         self.name, self.rate, self.size, self.counters = source.name, source.rate, source.size, source.counters
         self.times, self.is_exact, self.is_threaded = np.array([first.time]), False, False
-        self._first: UInt8 | None = first.image
+        self._first: UInt8 = first.image
         self._index: _Index | None = None
         self._lock = threading.RLock()
         self._reader: _Reader | None = None
@@ -142,7 +143,6 @@ class VideoFrames:
             if isinstance(self._source, Images):
                 return self._source.image(range(self._source.count())[self._part][number], (height, width, 3))
             if self._index is None:
-                assert self._first is not None
                 return self._first
             if self._reader is None:
                 self._reader = _Reader(self, self._source, self._index)
