@@ -11,7 +11,7 @@ sys.path += [str(Path(__file__).parent), str(Path(__file__).parents[2] / "benchm
 @pytest.fixture(scope="session")
 def video(demo_video):
     """A short demo video, and the object's box in each of its frames."""
-    path, boxes = demo_video(90)
+    path, boxes = demo_video(200)
     return str(path), boxes
 
 

@@ -127,10 +127,10 @@ class AnnotatePage {
     this.loading = true;
     while (this.wanted) {
       this.wanted = false;
-      const { frame, sent, state: { video } } = this, query = video ? `video=${video}` : "";
+      const { frame, sent, edits: { length }, state: { video } } = this, query = video ? `video=${video}` : "";
       const answer = await fetch(`frames/${frame}?${query}`).then((response) => response.ok && response.json(), () => null);
       if (!answer || video !== this.state.video) continue;
-      if (this.stage.picture?.frame === frame && (this.edits.length || sent !== this.sent)) { // it may be older than a box that is shown
+      if (this.stage.picture?.frame === frame && (length || this.edits.length || sent !== this.sent)) { // it may be older than a box that is shown
         await this.sent;
         this.wanted = true;
         continue;
