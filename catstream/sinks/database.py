@@ -17,7 +17,7 @@ from catstream.base.files import REMEDIES, open_locked
 from catstream.base.text import counted
 from catstream.errors import VideoError
 from catstream.messages.kinds import Track
-from catstream.sinks.destinations import Head, Origin, TrackedFrame
+from catstream.sinks.destinations import Head, Origin, Sink, TrackedFrame
 from catstream.sinks.remote import Warnings
 
 #: Column -> its type in SQLite. `seconds` is the time since the start of the source, `pts` the time stamp in a live
@@ -41,7 +41,7 @@ _MOST_WAITING = 1 << 16
 
 _CLOSE_SECONDS = 5.0  # wait for a locked database at the end
 
-#: Error of SQLite -> that of the system.
+#: The error of the system for errors of SQLite.
 _ERRNO = {sqlite3.SQLITE_FULL: errno.ENOSPC, sqlite3.SQLITE_READONLY: errno.EROFS, sqlite3.SQLITE_IOERR: errno.EIO}
 
 
@@ -49,7 +49,7 @@ class _LockedError(VideoError):
     """Another program has locked the database."""
 
 
-class SqliteSink:
+class SqliteSink(Sink):
     """A table with the tracks of each frame at once; written rows remain if this process crashes.
 
     An existing file is replaced, unless it is a log that is continued. While another program locks the database, frames
@@ -60,7 +60,7 @@ class SqliteSink:
     def __init__(self, place: str, origin: Origin) -> None:
         self._place, self._head, self._warnings = place, origin.head, Warnings(place)
         self._waiting: deque[TrackedFrame] = deque()
-        self._missed = 0
+        self.missed = 0
         self._database: sqlite3.Connection | None = None
         self._lock = open_locked(Path(place), VideoError, None)
         if origin.last is None:
@@ -79,14 +79,14 @@ class SqliteSink:
         self._waiting.append(frame)
         if len(self._waiting) > _MOST_WAITING:
             self._waiting.popleft()
-            self._missed += 1
+            self.missed += 1
         self._flush()
 
     def close(self) -> None:
         """Close the database; VideoError if it is still locked after some seconds."""
         try:
             self._flush(_CLOSE_SECONDS)
-            if lost := len(self._waiting) + self._missed:
+            if lost := len(self._waiting) + self.missed:
                 raise VideoError(
                     f"{self._place} lacks {counted(lost, 'frame')}, as another program locked it: if the run has an "
                     "NDJSON log, catstream export makes it again"

@@ -8,6 +8,7 @@ are made from a log afterwards.
 from __future__ import annotations
 
 import json
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -15,7 +16,7 @@ from importlib import import_module
 from importlib.metadata import version
 from math import nan
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol, Self, cast
+from typing import Any, NamedTuple, Self, cast
 
 import msgspec
 
@@ -155,17 +156,28 @@ class Origin:
     gap: int = 0
 
 
-class Sink(Protocol):
+class Sink(ABC):
     """Writes the frames in their order; created as `Class(place, origin)`.
 
     Its class may have a function `check(place, options)`, which raises VideoError before the run if the address or an
-    option is not valid; a method `idle()`, which is called every few seconds while no frame arrives; and `end()`, which
-    is called before any sink is closed, and sends the last events without waiting until they have arrived.
+    option is not valid.
+
+    missed  frames or messages that were dropped, as the destination was locked, slow or away
     """
 
+    missed = 0
+
+    @abstractmethod
     def write(self, frame: TrackedFrame) -> None:
         """Add a frame; raise VideoError if that is not possible."""
 
+    def idle(self) -> object:  # noqa: B027  # optional
+        """Continue without a frame; called every few seconds while none arrives."""
+
+    def end(self) -> object:  # noqa: B027
+        """Send the last events, without waiting until they have arrived; called before any sink is closed."""
+
+    @abstractmethod
     def close(self) -> None:
         """Complete the output; raise VideoError if that is not possible."""
 

@@ -20,7 +20,7 @@ from pathlib import Path
 from catstream.base.files import write_atomically
 from catstream.errors import CatstreamError, VideoError
 from catstream.messages.kinds import Preview, Track
-from catstream.sinks.destinations import Origin, SinkOptions, TrackedFrame
+from catstream.sinks.destinations import Origin, Sink, SinkOptions, TrackedFrame
 from catstream.sinks.events import Event
 from catstream.sinks.remote import EventStream, Warnings
 from catstream.video.drawing import Colours, draw_preview
@@ -31,7 +31,7 @@ _TRACKS = 1024  # frames whose tracks are stored for the pictures
 _LOG_BYTES = 10_000_000
 
 
-class EventsFolder:
+class EventsFolder(Sink):
     """Writes the files; a folder that cannot be written to is a warning, and the run continues."""
 
     def __init__(self, place: str, origin: Origin) -> None:

@@ -29,7 +29,7 @@ from paho.mqtt.enums import CallbackAPIVersion, MQTTErrorCode
 from catstream.base.text import counted
 from catstream.errors import VideoError
 from catstream.messages.kinds import Preview
-from catstream.sinks.destinations import Origin, SinkOptions, TrackedFrame, redacted
+from catstream.sinks.destinations import Origin, Sink, SinkOptions, TrackedFrame, redacted
 from catstream.sinks.events import Event
 from catstream.sinks.remote import CLOSE_SECONDS, QUEUED, EventStream, Warnings, reason_of, split
 
@@ -49,7 +49,7 @@ class _Link(Enum):
     LOST = auto()
 
 
-class MqttSink:
+class MqttSink(Sink):
     """Publishes from the thread of paho-mqtt; if `QUEUED` messages wait there, further ones are missed.
 
     missed  messages that were dropped; once it is closed, all that the broker has not acknowledged

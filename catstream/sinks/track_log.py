@@ -15,7 +15,7 @@ import os
 import re
 import sys
 import time
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager, ExitStack, closing, suppress
 from dataclasses import dataclass, replace
@@ -64,7 +64,7 @@ _OPTIONAL = {"source_frame", "checked", "probability", "processing"}
 _TIME = r"-\d{8}T\d{6}"  # in the name of a rotated file
 
 
-class LineSink(ABC):
+class LineSink(Sink):
     """A file with a line for each track. Written lines remain if this process crashes.
 
     An existing file is replaced, or continued after its first `origin.size` bytes. If it is removed, renamed or
@@ -528,7 +528,7 @@ class OpenFiles(AbstractContextManager["OpenFiles"]):
     @property
     def missed(self) -> int:
         """Frames that could not be written everywhere, and messages that a destination on the network has missed."""
-        return self.not_written + sum(getattr(sink, "missed", 0) for sink in self._sinks.values())
+        return self.not_written + sum(sink.missed for sink in self._sinks.values())
 
     @property
     def trouble(self) -> str:
@@ -574,14 +574,12 @@ class OpenFiles(AbstractContextManager["OpenFiles"]):
     def idle(self) -> None:
         """Tell the destinations that no frame has arrived for a while."""
         for sink in self._sinks.values():
-            if hasattr(sink, "idle"):
-                sink.idle()
+            sink.idle()
 
     def end(self) -> None:
         """Tell the destinations that no frame follows, before one of them waits for its delivery."""
         for sink in self._sinks.values():
-            if hasattr(sink, "end"):
-                sink.end()
+            sink.end()
 
     def __exit__(self, *details: Any) -> None:
         self.end()

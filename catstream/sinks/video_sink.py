@@ -21,7 +21,7 @@ def open_video(place: str, origin: Origin) -> Sink:
     return PictureVideo(place, origin) if origin.attached else SourceVideo(place, origin.head)
 
 
-class SourceVideo:
+class SourceVideo(Sink):
     """An MP4 of the frames that have a track, with their tracks drawn in."""
 
     def __init__(self, place: str, head: Head) -> None:
@@ -49,7 +49,7 @@ class SourceVideo:
         self._video.close()
 
 
-class PictureVideo:
+class PictureVideo(Sink):
     """An MP4 of the small pictures that a running pipeline sends, with their tracks drawn in, at their true times."""
 
     def __init__(self, place: str, origin: Origin) -> None:

@@ -22,7 +22,7 @@ from urllib.parse import unquote, urlunsplit
 from catstream.base.text import counted
 from catstream.errors import VideoError
 from catstream.messages.kinds import Preview
-from catstream.sinks.destinations import Origin, SinkOptions, TrackedFrame
+from catstream.sinks.destinations import Origin, Sink, SinkOptions, TrackedFrame
 from catstream.sinks.events import Event
 from catstream.sinks.remote import CLOSE_SECONDS, QUEUED, EventStream, Warnings, reason_of, split
 
@@ -33,7 +33,7 @@ _LONGEST_RETRY_AFTER = 600.0  # seconds that a receiver may ask to wait
 _AGAIN = {0, 408, 425, 429, *range(500, 600)}  # answers after which it is; 0 for none
 
 
-class Webhook:
+class Webhook(Sink):
     """Posts the events from a thread of its own; if `QUEUED` of them wait, further ones are missed.
 
     missed  events that were dropped, because too many waited; once it is closed, all that were not delivered
