@@ -95,11 +95,12 @@ class Summary:
 _COLUMNS = tuple(field.name for field in fields(Summary))
 
 
-def read_boxes(table: Path) -> dict[str, list[Keyframe]]:
-    """Read the boxes of each video from a table with the columns file, object, x, y, w, h, and optionally frame.
+def read_videos(table: Path) -> list[Video]:
+    """Read the videos of a table with the columns file, object, x, y, w, h, and optionally frame.
 
-    The frame is 0 by default. An empty object has no name; `absent` in x is no box. Raises VideoError if the table
-    cannot be read, a column is missing, or a value is invalid.
+    A path is relative to the folder of the table. The frame is 0 by default. An empty object has no name; `absent` in
+    x is no box. Raises VideoError if the table cannot be read, a column is missing, a value is invalid, or two videos
+    have the same name; BoxError if an object has two boxes in one frame.
     """
     boxes: dict[str, list[Keyframe]] = {}
 
@@ -110,14 +111,6 @@ def read_boxes(table: Path) -> dict[str, list[Keyframe]]:
 
     for file, keyframe in read_table(table, ("file", "object", "x", "y", "w", "h"), parse):
         boxes.setdefault(file, []).append(keyframe)
-    return boxes
-
-
-def videos_of(table: Path, boxes: Mapping[str, Iterable[Keyframe]]) -> list[Video]:
-    """The videos with these boxes, whose paths are relative to the folder of the table.
-
-    Raises VideoError if two have the same name, and BoxError if an object has two boxes in one frame.
-    """
     videos = []
     for file, keyframes in boxes.items():
         path = (table.parent / file).absolute()
@@ -131,11 +124,6 @@ def videos_of(table: Path, boxes: Mapping[str, Iterable[Keyframe]]) -> list[Vide
     if twice := sorted({name for name in names if names.count(name) > 1}):
         raise VideoError(f"several videos would have the results {listed(twice)}: rename their files")
     return videos
-
-
-def read_videos(table: Path) -> list[Video]:
-    """The videos of a table, with the errors of `read_boxes` and `videos_of`."""
-    return videos_of(table, read_boxes(table))
 
 
 def check_results(videos: Iterable[Video], output: Path) -> None:

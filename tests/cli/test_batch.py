@@ -10,8 +10,7 @@ import psutil
 import pytest
 
 from catstream import MultiTracker
-from catstream.base.box import Box
-from catstream.batch import videos_of
+from catstream.batch import read_videos
 from catstream.sinks.track_log import Log
 from catstream.video.source import open_source
 
@@ -133,8 +132,8 @@ def test_a_line_for_each_video_that_has_ended_is_printed_without_a_terminal(demo
 def test_only_the_suffix_of_a_file_is_no_part_of_the_name_of_its_results(tmp_path):
     for folder in ("seq.01", "seq.02"):
         (tmp_path / folder).mkdir()
-    boxes = {name: [("", 0, Box(1, 2, 30, 40))] for name in ("seq.01", "./seq.02", "a/cam.2.mp4")}
-    assert [video.name for video in videos_of(tmp_path / "t.csv", boxes)] == ["seq.01", "seq.02", "a_cam.2"]
+    boxes = table(tmp_path, *(f"{name},,1,2,30,40,0" for name in ("seq.01", "./seq.02", "a/cam.2.mp4")))
+    assert [video.name for video in read_videos(boxes)] == ["seq.01", "seq.02", "a_cam.2"]
 
 
 def test_existing_logs_of_something_else_are_not_replaced(demo, fail, tmp_path):
