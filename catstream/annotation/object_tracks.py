@@ -28,7 +28,7 @@ class ObjectTracks:
 
     @cached_property
     def unchecked(self) -> Bool:
-        """Whether each frame is unchecked, bool (frames,)."""
+        """Mask of the unchecked frames, bool (frames,)."""
         unchecked = self.probabilities < CHECKED
         unchecked[[*self.keyframes]] = False
         return unchecked

@@ -100,12 +100,12 @@ class Session:
         """Delete the box of an object at a frame; without a frame, or with its last box, delete the object."""
         with self.lock:
             before = self.annotation.keyframes
-            left = {name: drawn for name, drawn in before.items() if name != object}
-            kept = {place: box for place, box in before.get(object, {}).items() if frame not in (None, place)}
-            if any(isinstance(box, Box) for box in kept.values()):
-                left = {name: kept if name == object else drawn for name, drawn in before.items()}
-            if left != before:
-                self._replace(left)
+            boxes = {number: box for number, box in before.get(object, {}).items() if frame not in (None, number)}
+            after = {name: boxes if name == object else drawn for name, drawn in before.items()}
+            if not any(isinstance(box, Box) for box in boxes.values()):
+                after.pop(object, None)
+            if after != before:
+                self._replace(after)
                 self._history.append((object, frame, before))
 
     def rename(self, object: str, name: str) -> None:
@@ -301,7 +301,7 @@ class Sessions:
         return self._sessions[number]
 
     def open(self, number: int) -> None:
-        """Open another video, and write the results of the one that was open. VideoError if one of them fails."""
+        """Open another video, and write the results of the previous one; VideoError if either fails."""
         with self._lock:
             before = self.current
             if number == self.number or before.finished.is_set():

@@ -77,7 +77,7 @@ class Columns:
         for self.start, line in enumerate(lines, 1):
             self.separator = max(",;\t", key=line.count)
             self.names = [name.lower() for name in self._split(line)]
-            if any(self.names) and not line.startswith("sep="):  # by which Excel is told the separator
+            if any(self.names) and not line.startswith("sep="):  # a line for Excel, before the names
                 break
         if missing := [column for column in required if self.start and column not in self.names]:
             names = ",".join(required)

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING
 import click
 from rich.progress import Progress
 
-from catstream.base.files import locked_folder
+from catstream.base.files import check_distinct, locked_folder
 from catstream.base.settings import Settings
 from catstream.base.tables import write_table
-from catstream.base.text import counted, listed
+from catstream.base.text import counted
 from catstream.base.threads import cores
 from catstream.cli.common import INTERRUPTS, line_of, messages, stopped
 from catstream.cli.options import FOLDER, PATH, with_overrides, with_overwrite, with_reading
@@ -163,11 +163,8 @@ def _serve(
         name if [*names.values()].count(name) == 1 else f"{Path(video).absolute().parent.name}_{name}"
         for video, name in names.items()
     ]
-    if twice := sorted({label for label in labels if labels.count(label) > 1}):
-        raise VideoError(f"several videos would have the results {listed(twice)}: rename their files")
-    folders = [(output or Path()) / f"{label}-annotation" for label in labels]
-    if output and not several:
-        folders = [output]
+    folders = [output] if output and not several else [(output or Path()) / f"{label}-annotation" for label in labels]
+    check_distinct(zip((f"the results of {video}" for video in names), folders, strict=True), VideoError)
 
     # Step 2: Each video is opened when the page first shows it, and continues with its saved boxes.
     context, results = click.get_current_context(), dict[int, _ResultFiles]()

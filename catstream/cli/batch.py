@@ -83,11 +83,10 @@ def batch(
             for done, row in enumerate(tracked, 1):
                 progress.update(task, advance=1, description=row.video)
                 if not console.is_interactive:
-                    left = timedelta(seconds=round((time.monotonic() - began) / done * (total - done)))
-                    result = (
-                        row.error or f"{counted(row.frames, 'frame')}, {row.present / max(row.tracks, 1):.0%} present"
-                    )
-                    console.print(f"{done} of {total} ({done / total:.0%}), {left} left: {row.video}: {result}")
+                    remaining = timedelta(seconds=round((time.monotonic() - began) / done * (total - done)))
+                    present = f"{counted(row.frames, 'frame')}, {row.present / max(row.tracks, 1):.0%} present"
+                    state = f"{done} of {total} ({done / total:.0%}), {remaining} left"
+                    console.print(f"{state}: {row.video}: {row.error or present}")
     except KeyboardInterrupt:
         stopped("the results so far are saved; the same command continues")
     summaries = [batch.rows[video.file] for video in videos if video.file in batch.rows]

@@ -263,8 +263,9 @@ class _Run:
         for file in pipeline.saved_models:
             console.print(f"saved model: {file}")
         if interrupted:
-            kept = ["the results so far are kept"] if progress.frames or self.is_resumed else []
-            parts = ["some results are missing"] if missing else kept
+            parts = ["some results are missing"] if missing else []
+            if not missing and (progress.frames or self.is_resumed):
+                parts.append("the results so far are kept")
             if unsaved := [str(file) for file in pipeline.results.models.values() if file not in pipeline.saved_models]:
                 parts.append(f"not saved: {', '.join(unsaved)}")
             if self.folder is not None and contains_run(self.folder):

@@ -58,7 +58,7 @@ class Scale(NamedTuple):
         return "-" if math.isnan(value) else f"{value:.{digits}f} {self.unit}{per}"
 
 
-#: Columns of the table of objects: those of `_Object.row`.
+#: Columns of the table of objects, in the order of `_Object.row`.
 _COLUMNS = ("frames", "present", "doubtful", "absent", "checked", "seconds", "distance", "mean_speed", "maximum_speed")
 
 
@@ -120,8 +120,8 @@ class _Object:
         """The middles of all stretches of these seconds, and the mean speed in each; NaN if a part of it is unknown."""
         if len(self.steps) < (window := max(1, round(seconds / self.interval))):
             return np.empty(0), np.empty(0)
-        known = ~np.isnan(self.steps)
-        rows = np.cumsum([np.where(known, self.steps, 0), np.diff(self.times), ~known], axis=1)
+        is_unknown = np.isnan(self.steps)
+        rows = np.cumsum([np.nan_to_num(self.steps), np.diff(self.times), is_unknown], axis=1)
         sums = np.pad(rows, [(0, 0), (1, 0)])
         distances, durations, unknown = sums[:, window:] - sums[:, :-window]
         durations[(unknown > 0) | (durations <= 0)] = np.nan
@@ -199,8 +199,8 @@ class Section:
             points = np.column_stack([1000 * (middles - self.start) / duration, 460 - 440 * values / top])
             points = points[:: len(points) // _POINTS + 1]
             parts = np.split(points, np.flatnonzero(np.diff(np.isnan(points[:, 1]))) + 1)
-            shown = (part for part in parts if len(part) and not np.isnan(part[0, 1]))
-            lines[name] = [" ".join(f"{x:.1f},{y:.1f}" for x, y in part) for part in shown]
+            curves = (part for part in parts if len(part) and not np.isnan(part[0, 1]))
+            lines[name] = [" ".join(f"{x:.1f},{y:.1f}" for x, y in curve) for curve in curves]
         return lines, float(top)
 
 

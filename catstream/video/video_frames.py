@@ -65,7 +65,7 @@ class _Index:
 
     @cached_property
     def is_unique(self) -> bool:
-        """Whether each frame has a packet of its own; if not, frames are counted from the first one."""
+        """True if each frame has a packet of its own; if not, frames are counted from the first one."""
         return bool((self.packets >= 0).all()) and len(np.unique(self.packets)) == len(self.packets)
 
     @cached_property
@@ -95,7 +95,7 @@ def _row(packet: Packet[Any], damaged: int = 0) -> tuple[int, ...]:
 
 
 class VideoFrames:
-    """The images of a video by number, uint8 (h, w, 3) in BGR: those of `open_source`, in any order.
+    """Random access to the images of a video, uint8 (h, w, 3) in BGR: frame n is the n-th image of `open_source`.
 
     Reading forwards decodes each frame once. Reading backwards decodes a group of pictures once if it fits into the
     cache, otherwise once for each part that does. Several threads may read. A pickled copy opens the file anew.
