@@ -218,7 +218,13 @@ class Subscription(Generic[Message]):
         return 1000 * max(0.0, min(remaining, CHECK_SECONDS))
 
     def _is_over(self) -> bool:
-        return self.end is not None and monotonic() >= self._close_time
+        """Whether the iteration ends now; what has not arrived of the frames before the end is then missed."""
+        if self.end is None or monotonic() < self._close_time:
+            return False
+        if self._channel.keeps == "every":
+            with self._turn:
+                self._gaps.end(self.end)
+        return True
 
     def _take(self, deadline: float) -> Message | None:
         """The next message if one has arrived, without waiting; also runs periodic housekeeping."""
@@ -233,8 +239,6 @@ class Subscription(Generic[Message]):
                 self._look_for_pipeline()
             if self.end is None:
                 self._check_timeout(deadline - self._clock())
-            elif self._is_over() and self._channel.keeps == "every":
-                self._gaps.end(self.end)
             return None
 
     def _receive(self) -> Message | None:
