@@ -24,9 +24,9 @@ from catstream.base.settings import Settings
 from catstream.base.threads import one_thread
 from catstream.base.workers import run_tasks
 from catstream.errors import SettingsError
-from catstream.evaluation.datasets import Sequence
-from catstream.evaluation.onepass import Run, follow
-from catstream.evaluation.scores import overlaps
+from catstream.measure.datasets import Sequence
+from catstream.measure.onepass import Run, follow
+from catstream.measure.scores import overlaps
 from catstream.tracker import Tracker
 
 #: Headings for the values of `means`.

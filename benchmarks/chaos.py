@@ -36,19 +36,19 @@ from catstream.base.box import Box
 from catstream.base.settings import Settings
 from catstream.client.attach import control
 from catstream.client.control import Control
-from catstream.compression.forest import Forest
+from catstream.coreset.forest import Forest
 from catstream.errors import ServiceError
-from catstream.evaluation.datasets import Sequence
-from catstream.evaluation.scores import score
-from catstream.jobs.job import Job
-from catstream.messages.kinds import Answer, End, Track, Tracks
+from catstream.measure.datasets import Sequence
+from catstream.measure.scores import score
 from catstream.multi import MultiTracker
+from catstream.processes.job import Job
 from catstream.processes.process import PERMANENT_FAILURE
 from catstream.processes.start_server import NAMES, close_start_server, start_server
 from catstream.processes.supervisor import Child
 from catstream.video.source import open_source
 from catstream.wire.channels import MODELS
 from catstream.wire.endpoint import Endpoint
+from catstream.wire.messages import Answer, End, Track, Tracks
 from catstream.wire.newest import Subscriber
 from catstream.wire.results import ResultsReceiver
 
@@ -61,8 +61,8 @@ _MODULE = """
 import json, os, time
 from catstream.base.threads import limit_process
 limit_process()  # before anything imports numpy
-from catstream.compression.forest import Forest
-from catstream.messages.heads import TREES
+from catstream.coreset.forest import Forest
+from catstream.wire.heads import TREES
 _folder, _true, _take = os.environ["ARENA"], time.time, Forest.take
 def _shifted():
     try:

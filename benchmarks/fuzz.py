@@ -28,14 +28,14 @@ COMPILED = ["catstream.features.kernels"]  # by numba: no bytecode
 with atheris.instrument_imports(include=["catstream"], exclude=COMPILED):
     from catstream.base.box import Box
     from catstream.base.settings import Settings
-    from catstream.compression.forest import Forest
+    from catstream.client.saved_model import SavedModel
+    from catstream.coreset.forest import Forest
     from catstream.errors import CatstreamError, ProtocolError, ServiceError, SettingsError
-    from catstream.jobs.saved_model import SavedModel
-    from catstream.messages import storage
-    from catstream.messages.heads import GROUPS
-    from catstream.messages.kinds import DetectorState, Features, ObjectFeatures, TrainingRows
+    from catstream.wire import storage
     from catstream.wire.codec import KINDS, decode, encode, topic_of
+    from catstream.wire.heads import GROUPS
     from catstream.wire.keys import Keys, create
+    from catstream.wire.messages import DetectorState, Features, ObjectFeatures, TrainingRows
 
     sys.path.append(str(Path(__file__).parents[1]))
     from tests.wire.examples import example
@@ -122,7 +122,7 @@ def grown() -> Forest:
 
 def narrow(path: Path) -> SavedModel:
     """Return a saved model whose rows have `WIDTH` columns."""
-    with patch("catstream.jobs.saved_model.ROW_LENGTH", WIDTH):
+    with patch("catstream.client.saved_model.ROW_LENGTH", WIDTH):
         return SavedModel.load(path)
 
 

@@ -13,9 +13,9 @@ import psutil
 
 from catstream.base.names import Boxes
 from catstream.base.settings import Settings
-from catstream.messages.kinds import Track
 from catstream.pipeline import Pipeline
 from catstream.video.source import ALL_FRAMES
+from catstream.wire.messages import Track
 
 
 class Look(NamedTuple):

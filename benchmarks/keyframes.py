@@ -20,13 +20,13 @@ import numpy as np
 from accuracy import accuracy_command, in_processes, videos
 from table import Table, benchmark
 
-from catstream.annotation.annotation import Annotation
-from catstream.annotation.passes import box_of, iou, row_of
 from catstream.base.arrays import Bool, Float64
 from catstream.base.box import Box
 from catstream.base.settings import Settings
 from catstream.errors import BoxError, VideoError
-from catstream.evaluation.datasets import Sequence
+from catstream.measure.datasets import Sequence
+from catstream.offline.annotation import Annotation
+from catstream.offline.passes import box_of, iou, row_of
 
 #: The measures of a row, with their headings.
 MEASURES = {

@@ -19,7 +19,7 @@ from sequences import named
 from table import Table, benchmark, command
 
 from catstream.base.settings import Settings
-from catstream.evaluation.datasets import Sequence
+from catstream.measure.datasets import Sequence
 from catstream.tracker import Tracker
 
 TRACKERS = ("catstream", "csrt", "kcf", "mil", "nano", "nano-v3")

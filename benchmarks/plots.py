@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from html import escape
 
-from catstream.reports.report import COLOURS
+from catstream.output.report import COLOURS
 
 Points = Sequence[tuple[float, float]]
 

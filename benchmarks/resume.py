@@ -21,10 +21,10 @@ from sequences import FIRST, objects, scratch
 from table import Table, benchmark, command
 
 from catstream.base.settings import Settings
-from catstream.compression.checkpoint_store import CheckpointStore
+from catstream.coreset.checkpoint_store import CheckpointStore
 from catstream.errors import ServiceError
-from catstream.jobs.state import CHECKPOINTS
-from catstream.sinks.track_log import Log
+from catstream.output.track_log import Log
+from catstream.processes.state import CHECKPOINTS
 from catstream.video.live_demo import first_box
 from catstream.video.rendered import write
 

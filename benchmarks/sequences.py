@@ -14,7 +14,7 @@ import numpy as np
 
 from catstream.base.box import Box
 from catstream.errors import BoxError, VideoError
-from catstream.evaluation.datasets import Sequence, find_sequences
+from catstream.measure.datasets import Sequence, find_sequences
 from catstream.tracker import Tracker
 from catstream.video.rendered import FRAMES, SIZE, Sprite, cut_out_dahlia, load_photograph, write
 from catstream.video.source import open_source

@@ -27,10 +27,10 @@ from table import Table, benchmark, command
 from catstream.base.box import Box
 from catstream.base.names import UNNAMED
 from catstream.base.settings import Settings
-from catstream.compression.forest import Forest
+from catstream.coreset.forest import Forest
 from catstream.detection.objects import Detectors
-from catstream.evaluation.datasets import Sequence
 from catstream.features.pyramid import Pyramid
+from catstream.measure.datasets import Sequence
 from catstream.training.trainer import Trainer
 
 TRACKERS = ("catstream", "csrt", "kcf")

@@ -15,7 +15,7 @@ import numpy as np
 
 from catstream.base.box import Box
 from catstream.errors import BoxError, VideoError
-from catstream.evaluation.datasets import Sequence
+from catstream.measure.datasets import Sequence
 
 
 @dataclass(frozen=True, slots=True)

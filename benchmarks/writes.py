@@ -27,14 +27,14 @@ import numpy as np
 from resume import TRACK, written
 from table import Cell, Table, benchmark, command
 
-from catstream.compression.checkpoint_store import CheckpointStore
-from catstream.compression.forest import Forest
-from catstream.jobs.state import CHECKPOINTS
-from catstream.loadtest.camera import Camera, Schedule
-from catstream.loadtest.load import render
-from catstream.loadtest.result import Plan
+from catstream.coreset.checkpoint_store import CheckpointStore
+from catstream.coreset.forest import Forest
+from catstream.measure.camera import Camera, Schedule
+from catstream.measure.load import render
+from catstream.measure.load_result import Plan
 from catstream.multi import MultiTracker
 from catstream.processes.decisions import sync_interval
+from catstream.processes.state import CHECKPOINTS
 
 _MARKS = (1_000, 10_000, 25_000, 50_000, 100_000)
 

@@ -19,21 +19,21 @@ from typing import TYPE_CHECKING, Any
 from catstream.errors import require_linux
 
 if TYPE_CHECKING:
-    from catstream.annotation.annotation import Annotation, annotate
     from catstream.base.box import Box
     from catstream.base.settings import Settings
     from catstream.client.attach import control, subscribe
     from catstream.client.control import Control
+    from catstream.client.saved_model import SavedModel, merge
     from catstream.client.subscription import Subscription
-    from catstream.compression.tree import CoresetTree, FrequentDirections
+    from catstream.coreset.tree import CoresetTree, FrequentDirections
     from catstream.errors import CatstreamError
-    from catstream.finding.find import Detection, find
     from catstream.fleet.fleet import Fleet
-    from catstream.jobs.saved_model import SavedModel, merge
-    from catstream.messages.kinds import Track
     from catstream.multi import MultiTracker
+    from catstream.offline.annotation import Annotation, annotate
+    from catstream.offline.find import Detection, find
     from catstream.pipeline import Pipeline
     from catstream.tracker import Tracker
+    from catstream.wire.messages import Track
 
 __all__ = [
     "Annotation",
@@ -62,25 +62,25 @@ __all__ = [
 __version__ = "0.1.0"
 
 _HOMES = {
-    "Annotation": "annotation.annotation",
+    "Annotation": "offline.annotation",
     "Box": "base.box",
     "CatstreamError": "errors",
     "Control": "client.control",
-    "CoresetTree": "compression.tree",
+    "CoresetTree": "coreset.tree",
     "Fleet": "fleet.fleet",
-    "FrequentDirections": "compression.tree",
-    "SavedModel": "jobs.saved_model",
+    "FrequentDirections": "coreset.tree",
+    "SavedModel": "client.saved_model",
     "MultiTracker": "multi",
     "Pipeline": "pipeline",
     "Settings": "base.settings",
-    "Detection": "finding.find",
+    "Detection": "offline.find",
     "Subscription": "client.subscription",
-    "Track": "messages.kinds",
+    "Track": "wire.messages",
     "Tracker": "tracker",
-    "annotate": "annotation.annotation",
+    "annotate": "offline.annotation",
     "control": "client.attach",
-    "find": "finding.find",
-    "merge": "jobs.saved_model",
+    "find": "offline.find",
+    "merge": "client.saved_model",
     "subscribe": "client.attach",
 }
 

@@ -15,8 +15,6 @@ from typing import NamedTuple
 
 from msgspec import convert
 
-from catstream.annotation.annotation import Annotation
-from catstream.annotation.keyframes import Keyframe, KeyframeBox, by_object, format_keyframe, parse_row
 from catstream.base.box import Box
 from catstream.base.settings import Settings
 from catstream.base.tables import Row, read_table, write_table
@@ -24,12 +22,14 @@ from catstream.base.text import listed
 from catstream.base.threads import one_thread
 from catstream.base.workers import run_tasks
 from catstream.errors import BoxError, CatstreamError, ServiceError, VideoError
-from catstream.jobs.job import Results
-from catstream.messages.kinds import Track
 from catstream.multi import MultiTracker
-from catstream.sinks.destinations import Head, Origin, TrackedFrame
-from catstream.sinks.track_log import Log, RunFiles, places_of
+from catstream.offline.annotation import Annotation
+from catstream.offline.keyframes import Keyframe, KeyframeBox, by_object, format_keyframe, parse_row
+from catstream.output.destinations import Head, Origin, TrackedFrame
+from catstream.output.track_log import Log, RunFiles, places_of
+from catstream.processes.job import Results
 from catstream.video.source import open_source
+from catstream.wire.messages import Track
 
 #: Name of the table of results in the folder of a batch.
 SUMMARIES = "batch.csv"

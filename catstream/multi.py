@@ -19,16 +19,16 @@ from catstream.base.names import UNNAMED, Boxes, boxes_by_name, by_name, check_c
 from catstream.base.settings import Settings
 from catstream.base.text import listed
 from catstream.base.threads import one_thread
-from catstream.compression.compressor import Compressor
-from catstream.compression.forest import Forest
+from catstream.client.saved_model import SavedModel
+from catstream.coreset.compressor import Compressor
+from catstream.coreset.forest import Forest
 from catstream.detection.objects import Detectors
 from catstream.errors import BoxError, CatstreamError, FrameError, ObjectError
 from catstream.features.pyramid import Pyramid
-from catstream.jobs.saved_model import SavedModel
-from catstream.messages.kinds import Features, Track, Tracks
 from catstream.training import motion_em
 from catstream.training.trainer import Trainer
 from catstream.video.frames import as_bgr
+from catstream.wire.messages import Features, Track, Tracks
 
 
 class MultiTracker:

@@ -24,15 +24,15 @@ from catstream.base.forks import check_not_forked, forked, generation
 from catstream.base.names import Boxes
 from catstream.base.settings import Settings
 from catstream.errors import ServiceError, SettingsError
-from catstream.jobs.job import Job, Models, Results, files_by_name
-from catstream.jobs.probe import probe
-from catstream.jobs.state import check_new, locked_for_run, position, saved
-from catstream.messages.kinds import RunState, Track, run_state
+from catstream.output.destinations import Head
+from catstream.processes.job import Job, Models, Results, files_by_name
+from catstream.processes.probe import probe
 from catstream.processes.start_server import start_server
+from catstream.processes.state import check_new, locked_for_run, position, saved
 from catstream.processes.supervisor import Supervisor
-from catstream.sinks.destinations import Head
 from catstream.video.source import ALL_FRAMES, source_text
 from catstream.wire.discovery import private_folder, reserve_endpoint
+from catstream.wire.messages import RunState, Track, run_state
 
 _ONCE = "a pipeline runs once, and this one has run: make another Pipeline to track the source again"
 _CLOSED = ExitStack()  # marks a pipeline that was closed

@@ -13,8 +13,8 @@ from sklearn.utils.validation import check_is_fitted, validate_data
 
 from catstream.base.arrays import Float64
 from catstream.base.threads import one_thread
-from catstream.compression.reduce import reduce
-from catstream.compression.tree import CoresetTree
+from catstream.coreset.reduce import reduce
+from catstream.coreset.tree import CoresetTree
 
 _TYPES = (np.float64, np.float32)
 

@@ -9,9 +9,9 @@ import numpy as np
 from catstream.base.box import Box
 from catstream.base.names import UNNAMED
 from catstream.base.settings import Settings
-from catstream.jobs.saved_model import SavedModel
-from catstream.messages.kinds import Track
+from catstream.client.saved_model import SavedModel
 from catstream.multi import MultiTracker
+from catstream.wire.messages import Track
 
 
 class Tracker:

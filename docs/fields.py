@@ -9,8 +9,9 @@ from textwrap import fill
 from typing import Any, Literal, get_args, get_origin
 
 from catstream.base.box import Box, Window
-from catstream.messages.heads import TREES
-from catstream.messages.kinds import (
+from catstream.wire.codec import KINDS
+from catstream.wire.heads import TREES
+from catstream.wire.messages import (
     Motion,
     ObjectFeatures,
     Position,
@@ -19,8 +20,7 @@ from catstream.messages.kinds import (
     Tracks,
     TrainingRows,
 )
-from catstream.messages.schema import fields
-from catstream.wire.codec import KINDS
+from catstream.wire.schema import fields
 
 PAGE = Path(__file__).with_name("protocol.md")
 

@@ -13,7 +13,7 @@ import sys
 from collections import defaultdict
 
 import catstream
-from catstream.sinks.events import Event, Events
+from catstream.output.events import Event, Events
 
 
 class Counter:

@@ -43,13 +43,13 @@ from catstream.base.threads import one_thread
 from catstream.cli import main
 from catstream.cli.common import INTERRUPTS
 from catstream.fleet.registry import RegistryServer
-from catstream.messages.kinds import Answer, Command
 from catstream.video.rendered import render, write
 from catstream.video.source import open_source
 from catstream.wire.channels import CHANNELS, CONTROL
 from catstream.wire.commands import Responder
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.keys import allow, create
+from catstream.wire.messages import Answer, Command
 
 # No time is a pass mark.
 hypothesis.settings.register_profile(

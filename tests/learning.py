@@ -4,10 +4,10 @@ import numpy as np
 
 from catstream.base.box import Box, Window
 from catstream.features.layout import ROW_LENGTH
-from catstream.messages.heads import APPEARANCE, EXTENT
-from catstream.messages.kinds import DetectorState, ObjectFeatures, TrainingRows
 from catstream.tracker import Tracker
 from catstream.video.source import open_source
+from catstream.wire.heads import APPEARANCE, EXTENT
+from catstream.wire.messages import DetectorState, ObjectFeatures, TrainingRows
 
 BOX, WINDOW = Box(1.0, 2.0, 30.0, 40.0), Window(0.0, 0.0, 40.0, 50.0)
 

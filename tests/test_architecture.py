@@ -18,22 +18,22 @@ LEVELS = [set(names.replace(",", " ").split()) for names in reversed(SHOWN.split
 #: The files or folders of catstream/ that may import a foreign library; empty: all.
 IMPORTERS = {
     "numpy": "",
-    "scipy": "base/threads.py compression/reduce.py numerics/ridge.py",
-    "cv2": "base/threads.py detection features paper processes/detector.py sinks/events.py video",
+    "scipy": "base/threads.py base/ridge.py coreset/reduce.py",
+    "cv2": "base/threads.py detection features processes/detector.py output/events.py video",
     "filterpy": "training/motion_em.py",
     "numba": "features/kernels.py",
-    "sklearn": "paper/one_class.py paper/scm.py sketch.py video/rendered.py",
-    "safetensors": "messages/storage.py",
+    "sklearn": "detection/scm.py sketch.py training/one_class.py video/rendered.py",
+    "safetensors": "wire/storage.py",
     "obstore": "fleet/store.py",
     "ray": "fleet",
-    "av": "loadtest/mjpeg.py video",
+    "av": "measure/mjpeg.py video",
     "zmq": "client/subscription.py wire",
-    "paho": "sinks/mqtt_sink.py",
+    "paho": "output/mqtt_sink.py",
     "msgpack": "wire/codec.py",
     "msgspec": "",
     "threadpoolctl": "base/threads.py",
-    "psutil": "fleet/fleet.py loadtest/latency.py",
-    "jinja2": "reports/report.py",
+    "psutil": "fleet/fleet.py measure/latency.py",
+    "jinja2": "output/report.py",
     "click": "cli",
     "starlette": "web",
     "uvicorn": "web/server.py",
@@ -45,8 +45,8 @@ IMPORTERS = {
 IO_MODULES = {"asyncio", "multiprocessing", "random", "socket", "subprocess", "threading", "time", "zmq"}
 
 #: Folders of the stages, and state machines with the same rule: bytes, events and the time are arguments.
-STAGES = {"features", "paper", "detection", "compression", "training"}
-PURE = "wire/go_back_n.py sinks/events.py processes/decisions.py processes/control_commands.py"
+STAGES = {"features", "detection", "coreset", "training"}
+PURE = "wire/go_back_n.py output/events.py processes/decisions.py processes/control_commands.py"
 
 FILES = sorted(ROOT.glob("catstream/**/*.py"))
 

@@ -14,7 +14,7 @@ import pytest
 
 from catstream.base.box import Box
 from catstream.errors import BoxError, SettingsError
-from catstream.evaluation.datasets import Sequence, find_sequences
+from catstream.measure.datasets import Sequence, find_sequences
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 sys.path.append(str(BENCHMARKS))

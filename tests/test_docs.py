@@ -18,10 +18,10 @@ import pytest
 import catstream
 from catstream.base.settings import PRESETS, describe
 from catstream.cli import COMMANDS, load_command
-from catstream.jobs.job import Results
-from catstream.sinks.destinations import SINKS
-from catstream.sinks.exports import EXPORTS
-from catstream.sinks.track_log import places_of
+from catstream.output.destinations import SINKS
+from catstream.output.exports import EXPORTS
+from catstream.output.track_log import places_of
+from catstream.processes.job import Results
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"

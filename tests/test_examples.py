@@ -20,9 +20,9 @@ import pytest
 
 import catstream
 from catstream.base.box import Box
-from catstream.messages.kinds import Track
 from catstream.pipeline import Pipeline
 from catstream.video.source import open_source
+from catstream.wire.messages import Track
 
 pytestmark = pytest.mark.system
 

@@ -16,7 +16,7 @@ import catstream
 catstream.Tracker, catstream.Pipeline, catstream.subscribe, catstream.control
 from catstream.cli import COMMANDS, load_command
 import catstream.processes.by_hand
-import catstream.evaluation.accuracy
+import catstream.measure.accuracy
 for name in COMMANDS:
     load_command(name)
 """

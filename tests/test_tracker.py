@@ -10,7 +10,7 @@ import pytest
 
 from catstream.base.box import Box
 from catstream.base.settings import PRESETS, Settings
-from catstream.compression.forest import Forest
+from catstream.coreset.forest import Forest
 from catstream.errors import BoxError, CatstreamError, FrameError, SettingsError
 from catstream.tracker import Tracker
 

@@ -36,16 +36,16 @@ from table import Table, benchmark, command
 from catstream.base.box import Box
 from catstream.base.settings import Settings
 from catstream.client.registry import REGISTRY_PORT, Registry
-from catstream.compression.forest import Forest
+from catstream.coreset.forest import Forest
 from catstream.errors import CatstreamError, ServiceError
 from catstream.fleet.fleet import Fleet
 from catstream.fleet.spec import FleetSpec, StreamSpec
 from catstream.fleet.store import Store
-from catstream.jobs.state import restore
-from catstream.messages.kinds import FleetStatus, StreamStatus
+from catstream.processes.state import restore
 from catstream.video import rendered
 from catstream.video.live_demo import first_box
 from catstream.wire.keys import allow
+from catstream.wire.messages import FleetStatus, StreamStatus
 
 NAME = "faults"
 NODES = ("node-2", "node-3")  # node-1 is the head

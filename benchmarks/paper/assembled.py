@@ -18,12 +18,12 @@ from catstream.base.names import UNNAMED
 from catstream.base.settings import Settings
 from catstream.base.threads import one_thread
 from catstream.base.workers import SPAWN
-from catstream.compression.compressor import Compressor
-from catstream.compression.tree import CoresetTree
+from catstream.coreset.compressor import Compressor
+from catstream.coreset.tree import CoresetTree
 from catstream.detection.objects import Detectors
-from catstream.evaluation.datasets import Sequence
+from catstream.detection.scm import SparseCollaborativeModel
 from catstream.features.pyramid import Pyramid
-from catstream.paper.scm import SparseCollaborativeModel
+from catstream.measure.datasets import Sequence
 from catstream.training.trainer import Trainer
 
 
@@ -59,7 +59,7 @@ def follow_each(recipes: dict[str, Recipe], sequence: Sequence, start: Start) ->
     """Run each recipe on one sequence, from the same start."""
     runs = []
     # SCM is slow and does not depend on the recipe, so each frame is computed once for all recipes.
-    with patch("catstream.paper.scm.SparseCollaborativeModel", Shared()):
+    with patch("catstream.detection.scm.SparseCollaborativeModel", Shared()):
         for name, recipe in recipes.items():
             runs.append(follow(name, recipe, sequence, start))
             print(f"{name}: {sequence.name}", file=sys.stderr)

@@ -32,10 +32,10 @@ from table import Table, benchmark, command
 from catstream.base.box import Box
 from catstream.base.threads import one_thread
 from catstream.base.workers import SPAWN
-from catstream.evaluation.datasets import Sequence
+from catstream.client.saved_model import SavedModel
 from catstream.features.score_map import non_maximum_suppression
-from catstream.finding.scan import Scan
-from catstream.jobs.saved_model import SavedModel
+from catstream.measure.datasets import Sequence
+from catstream.offline.find_scan import Scan
 from catstream.tracker import Tracker
 from catstream.video.source import open_source
 

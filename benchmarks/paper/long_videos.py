@@ -20,8 +20,8 @@ from sequences import named, scratch
 from table import Table, benchmark, command
 
 from catstream.base.settings import PRESETS, Settings
-from catstream.evaluation.datasets import Sequence
-from catstream.evaluation.scores import score
+from catstream.measure.datasets import Sequence
+from catstream.measure.scores import score
 from catstream.video.writer import VideoWriter
 
 #: Tracker -> mean success of the four longest TLD videos at 10, 20, 50, 75 and 100 thousand frames.

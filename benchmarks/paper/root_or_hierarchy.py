@@ -15,9 +15,9 @@ from assembled import Recipe, follow_all
 from table import Table, benchmark
 
 from catstream.base.settings import PRESETS, Settings
-from catstream.compression.node import sample
-from catstream.compression.tree import CoresetTree
-from catstream.messages.kinds import Summary
+from catstream.coreset.node import sample
+from catstream.coreset.tree import CoresetTree
+from catstream.wire.messages import Summary
 
 #: Training set -> success and precision in the paper.
 PAPER = {"root": (0.398, 0.434), "hierarchy": (0.524, 0.677)}

@@ -19,8 +19,8 @@ from assembled import Recipe, follow_all
 from table import Table, benchmark
 
 from catstream.base.settings import PRESETS, Settings
-from catstream.compression.tree import CoresetTree
-from catstream.messages.kinds import Summary
+from catstream.coreset.tree import CoresetTree
+from catstream.wire.messages import Summary
 
 SHARES = (0.25, 0.375, 0.5, 0.625, 0.75)
 

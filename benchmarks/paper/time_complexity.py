@@ -17,12 +17,12 @@ from sequences import named
 from table import Table, benchmark, command
 
 from catstream.base.box import Window
-from catstream.compression.tree import CoresetTree
+from catstream.coreset.tree import CoresetTree
 from catstream.detection.teacher import affine_copies
-from catstream.evaluation.datasets import Sequence
 from catstream.features.layout import ROW_LENGTH
 from catstream.features.pyramid import Pyramid
-from catstream.paper.one_class import one_class
+from catstream.measure.datasets import Sequence
+from catstream.training.one_class import one_class
 
 SIZES = (32, 64, 128, 256)
 _ORIGIN = np.zeros(ROW_LENGTH, np.float32)

@@ -17,7 +17,7 @@ from accuracy import TrackerRun, accuracy_command, compared, rows_of, videos
 from table import Table, benchmark
 
 from catstream.base.settings import PRESETS, Settings
-from catstream.evaluation.scores import score
+from catstream.measure.scores import score
 
 #: Our settings, and presets.
 TRACKERS = ("defaults", "cat25", "cat10")

@@ -19,14 +19,14 @@ from catstream.cli.common import INTERRUPTS, line_of, messages, stopped
 from catstream.cli.options import FOLDER, PATH, with_overrides, with_overwrite, with_reading
 from catstream.cli.view import HostPort, server_of, with_listen
 from catstream.errors import VideoError
-from catstream.jobs.job import Results
+from catstream.processes.job import Results
 from catstream.video.images import IMAGES, natural_order, visible
 from catstream.video.source import VIDEOS, open_source
 
 if TYPE_CHECKING:
-    from catstream.annotation.annotation import Annotation
-    from catstream.annotation.session import Sessions
-    from catstream.sinks.track_log import RunFiles
+    from catstream.offline.annotation import Annotation
+    from catstream.offline.session import Sessions
+    from catstream.output.track_log import RunFiles
 
 
 @click.command()
@@ -96,8 +96,8 @@ def annotate(
       catstream annotate walk.mp4 --boxes out/keyframes.csv --box anna@412=300,90,60,50 --output out --overwrite
     """
     with INTERRUPTS.leaving():
-        from catstream.annotation.annotation import Annotation
-        from catstream.annotation.keyframes import by_object, parse_keyframe, read_keyframes
+        from catstream.offline.annotation import Annotation
+        from catstream.offline.keyframes import by_object, parse_keyframe, read_keyframes
 
     drawn = by_object([*([] if csv_file is None else read_keyframes(csv_file)), *map(parse_keyframe, texts)])
     jobs, settings = jobs or cores(), Settings.from_values(overrides)
@@ -142,9 +142,9 @@ def _serve(
     videos: list[str], output: Path | None, settings: Settings, jobs: int, listen: HostPort, *, overwrite: bool
 ) -> None:
     """Serve the page of some videos until it is done or interrupted, and write the results."""
-    from catstream.annotation.annotation import Annotation
-    from catstream.annotation.keyframes import by_object, read_keyframes
-    from catstream.annotation.session import Session, Sessions
+    from catstream.offline.annotation import Annotation
+    from catstream.offline.keyframes import by_object, read_keyframes
+    from catstream.offline.session import Session, Sessions
 
     # Step 1: Name the videos that can be read, and their folders.
     names: dict[str, str] = {}
@@ -271,13 +271,13 @@ class _ResultFiles:
         self.save()
 
     def save(self) -> None:
-        from catstream.annotation.keyframes import write_keyframes
+        from catstream.offline.keyframes import write_keyframes
 
         write_keyframes(self.keyframes, self._annotation.keyframes, self._video)
 
     def write(self) -> None:
         """Write the log, and the table of the frames to look at next."""
-        from catstream.sinks.destinations import TrackedFrame
+        from catstream.output.destinations import TrackedFrame
 
         with self._log().opened("") as files:
             for tracks in zip(*self._annotation.tracks.values(), strict=True):
@@ -286,8 +286,8 @@ class _ResultFiles:
         write_table(self._next, ("frame", "object", "errors"), rows, VideoError)
 
     def _log(self) -> RunFiles:
-        from catstream.sinks.destinations import Head, Origin
-        from catstream.sinks.track_log import RunFiles, places_of
+        from catstream.output.destinations import Head, Origin
+        from catstream.output.track_log import RunFiles, places_of
 
         frames = self._annotation.frames
         changed = tuple(self._annotation.settings.changed())

@@ -25,8 +25,8 @@ from catstream.client.attach import control, subscribe, wait_until_running
 from catstream.client.control import Control
 from catstream.client.subscription import REASON_SECONDS, Subscription
 from catstream.errors import SilenceError
-from catstream.jobs.job import Job
-from catstream.jobs.state import learned
+from catstream.processes.job import Job
+from catstream.processes.state import learned
 from catstream.wire.channels import PUBLIC
 
 _IDLE_SECONDS = REASON_SECONDS  # without a message, after which `idle` is called; then repeated

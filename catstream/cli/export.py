@@ -14,11 +14,11 @@ from catstream.base.text import counted
 from catstream.cli.options import PATH, with_overwrite
 from catstream.cli.write import with_table
 from catstream.errors import VideoError
-from catstream.sinks import exports
-from catstream.sinks.annotations import About, classes_of
-from catstream.sinks.destinations import Head
-from catstream.sinks.exports import EXPORTS
-from catstream.sinks.track_log import JoinedLog, logs_of
+from catstream.output import exports
+from catstream.output.annotations import About, classes_of
+from catstream.output.destinations import Head
+from catstream.output.exports import EXPORTS
+from catstream.output.track_log import JoinedLog, logs_of
 from catstream.video.source import VIDEOS, open_source
 
 

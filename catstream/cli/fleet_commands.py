@@ -25,7 +25,7 @@ from catstream.cli.options import PATH, with_json
 from catstream.cli.view import HostPort, fleet_view, server_of, with_view
 from catstream.client.address import Address
 from catstream.errors import FleetError
-from catstream.messages.kinds import FleetStatus, StreamStatus
+from catstream.wire.messages import FleetStatus, StreamStatus
 
 if TYPE_CHECKING:
     from catstream.fleet.fleet import Fleet

@@ -26,7 +26,7 @@ from catstream.cli.common import (
 from catstream.cli.options import NumberRange, with_settings
 
 if TYPE_CHECKING:
-    from catstream.loadtest.result import Limit, Result
+    from catstream.measure.load_result import Limit, Result
 
 _QUIET_CORES = 0.25  # load by other processes above which a warning is printed
 
@@ -95,9 +95,9 @@ def loadtest(
       catstream loadtest --streams 4 --subscribers 50 --slow-subscribers 5 --report load.html
       catstream loadtest --find-streams --rate 25 --size 1920x1080
     """
-    from catstream.loadtest.load_report import answer, milliseconds, to_json, write_report
-    from catstream.loadtest.load_test import run_load_test
-    from catstream.loadtest.result import Limit, Plan, violations
+    from catstream.measure.load_report import answer, milliseconds, to_json, write_report
+    from catstream.measure.load_result import Limit, Plan, violations
+    from catstream.measure.load_test import run_load_test
 
     parsed = [Limit.parse(text) for text in limits or (("p99=0.1", "skipped=0") if find_streams else ())]
     parameters = Plan(**plan)
@@ -137,7 +137,7 @@ def loadtest(
 
 
 def _print_run(result: Result, limits: list[Limit]) -> None:
-    from catstream.loadtest.load_report import milliseconds, tables
+    from catstream.measure.load_report import milliseconds, tables
 
     click.echo(
         f"{result.plan}, {result.seconds:.1f} s; latencies in ms; the camera was at most "

@@ -56,9 +56,9 @@ def evaluate(
       catstream evaluate sequences/walk --set coreset.size=128
     """
     with INTERRUPTS.leaving():
-        from catstream.evaluation.accuracy import HEADINGS, Row, to_json, write_report
-        from catstream.evaluation.datasets import find_sequences
-        from catstream.evaluation.onepass import Run, evaluate
+        from catstream.measure.accuracy import HEADINGS, Row, to_json, write_report
+        from catstream.measure.datasets import find_sequences
+        from catstream.measure.onepass import Run, evaluate
 
     errors: list[CatstreamError] = []
     sequences = find_sequences(*paths, failed=errors.append)
@@ -121,8 +121,8 @@ def demo(output: Path, frames: int, render_only: bool, live: str | None) -> None
         import numpy as np
 
         from catstream.cli.track import track
-        from catstream.evaluation.scores import score
-        from catstream.sinks.track_log import Log
+        from catstream.measure.scores import score
+        from catstream.output.track_log import Log
         from catstream.video.rendered import write
 
     with line_of(messages()) as bar:

@@ -13,12 +13,12 @@ from catstream.base.text import counted
 from catstream.base.threads import one_thread
 from catstream.cli.common import INTERRUPTS, complain, line_of, messages, screen, stopped, table, text
 from catstream.cli.options import PATH, NumberRange, with_overwrite
+from catstream.client.saved_model import SavedModel
+from catstream.client.saved_model import merge as merged
 from catstream.errors import CatstreamError, VideoError
-from catstream.jobs.saved_model import SavedModel
-from catstream.jobs.saved_model import merge as merged
 
 if TYPE_CHECKING:
-    from catstream.finding.results import Interval
+    from catstream.offline.find_results import Interval
 
 _PRINTED = 12  # intervals that are printed
 
@@ -62,10 +62,10 @@ def find(
       catstream find --model anna.safetensors --model ben.safetensors videos/ photos/
     """
     with INTERRUPTS.leaving():
-        from catstream.finding.files import find_files
-        from catstream.finding.find import Search, load_models
-        from catstream.finding.results import FileResult, SearchResults, write_detections, write_report
-        from catstream.reports.report import clock
+        from catstream.offline.find import Search, load_models
+        from catstream.offline.find_files import find_files
+        from catstream.offline.find_results import FileResult, SearchResults, write_detections, write_report
+        from catstream.output.report import clock
 
     search = Search(load_models(models), threshold, every)
     files = find_files(paths)
@@ -111,7 +111,7 @@ def find(
 
 
 def _print(intervals: list[Interval]) -> None:
-    from catstream.reports.report import clock
+    from catstream.output.report import clock
 
     numbers = ("from", "to", "detections", "score")
     best = table("object", "file", *numbers, right=numbers)

@@ -13,9 +13,9 @@ from rich.text import Text
 
 from catstream.base.names import UNNAMED
 from catstream.base.text import counted
-from catstream.messages.kinds import Track
 from catstream.pipeline import Pipeline
 from catstream.video.frames import describe_counters
+from catstream.wire.messages import Track
 
 #: Seconds between two updates of the line on the terminal.
 REFRESH_SECONDS = 0.1

@@ -37,8 +37,8 @@ def report(files: tuple[Path, ...], skip_damaged: bool, scale: str, overwrite: b
     """
     with INTERRUPTS.leaving():
         from catstream.base.files import check_file
-        from catstream.reports.tracks import Scale, Section, write_report
-        from catstream.sinks.track_log import join_rotated, logs_of
+        from catstream.output.report_tracks import Scale, Section, write_report
+        from catstream.output.track_log import join_rotated, logs_of
 
     size = Scale.parse(scale)
     page = files[-1] / "report.html" if files[-1].is_dir() else files[-1].with_suffix(".html")

@@ -18,8 +18,8 @@ from catstream.cli.options import NumberRange, with_json
 from catstream.client.address import Address
 from catstream.client.attach import subscribe
 from catstream.errors import SilenceError
-from catstream.messages.kinds import Health, RunState, run_state
 from catstream.wire.channels import CHANNELS
+from catstream.wire.messages import Health, RunState, run_state
 
 _PROCESSES = CHANNELS["health"].senders
 

@@ -32,10 +32,7 @@ from catstream.cli.options import (
 from catstream.cli.progress import REFRESH_SECONDS, RunProgress
 from catstream.cli.view import HostPort, server_of, with_view
 from catstream.client.address import Address
-from catstream.jobs.job import Results
-from catstream.jobs.state import contains_run, files_of_state
-from catstream.pipeline import Pipeline
-from catstream.sinks.destinations import (
+from catstream.output.destinations import (
     SINKS,
     STDOUT,
     Origin,
@@ -46,8 +43,11 @@ from catstream.sinks.destinations import (
     kind_of,
     redacted,
 )
-from catstream.sinks.options import parse_rotation
-from catstream.sinks.track_log import OpenFiles, RunFiles, places_of
+from catstream.output.options import parse_rotation
+from catstream.output.track_log import OpenFiles, RunFiles, places_of
+from catstream.pipeline import Pipeline
+from catstream.processes.job import Results
+from catstream.processes.state import contains_run, files_of_state
 
 if TYPE_CHECKING:
     from catstream.web.feed import PipelineFeed

@@ -21,10 +21,10 @@ from catstream.cli.options import Command
 from catstream.client.address import Address
 from catstream.client.attach import REPORT_SECONDS, subscribe
 from catstream.errors import SettingsError, SilenceError
-from catstream.sinks.destinations import SINKS, Head, Origin, TrackedFrame
-from catstream.sinks.events import check_zones
-from catstream.sinks.options import OPTIONS, parse
-from catstream.sinks.track_log import RunFiles
+from catstream.output.destinations import SINKS, Head, Origin, TrackedFrame
+from catstream.output.events import check_zones
+from catstream.output.options import OPTIONS, parse
+from catstream.output.track_log import RunFiles
 
 _REPORTS = 12  # health reports of all processes in four seconds, one of which is from the detector
 

@@ -44,7 +44,7 @@ def subscribe(
         its registry, `fleet://FLEET/STREAM` for a fleet of this user, `fleet://STREAM` for the only one.
     channel : str
         "tracks", "models", "health", "samples", "features" or "previews": the messages are `Track`, `Model` and so on
-        of `catstream.messages.kinds`.
+        of `catstream.wire.messages`.
     object : str or None
         Name of the one object whose tracks, models or samples are received; "" for the object without a name, None for
         all objects.

@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 from catstream.base.names import UNNAMED
 from catstream.client.registry import Registry, described
 from catstream.client.subscription import DRAIN_SECONDS, Subscription
-from catstream.messages.kinds import End, Features, StreamStatus, Track
+from catstream.wire.messages import End, Features, StreamStatus, Track
 
 _QUIET_SECONDS = 1.0  # without a message of a stream, after which the registry is asked where it runs; then repeated
 

@@ -14,12 +14,12 @@ from uuid import uuid4
 import msgspec
 
 from catstream.errors import ServiceError, SilenceError
-from catstream.messages.kinds import FleetStatus, Listing, Question, StreamStatus
 from catstream.wire.channels import REGISTRY
 from catstream.wire.commands import Requester
 from catstream.wire.discovery import fleets
 from catstream.wire.endpoint import Endpoint, resolved
 from catstream.wire.keys import Keys
+from catstream.wire.messages import FleetStatus, Listing, Question, StreamStatus
 
 #: Port at which the registry of a cluster listens by default.
 REGISTRY_PORT = 5690

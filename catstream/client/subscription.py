@@ -20,9 +20,9 @@ from catstream.base.clock import RunningClock
 from catstream.base.forks import check_not_forked, generation
 from catstream.base.names import check_name
 from catstream.errors import ServiceError, SilenceError
-from catstream.messages.kinds import End, Features, Health, Track, run_state
 from catstream.wire.channels import HEALTH, PUBLIC, TRACKS, Channel
 from catstream.wire.endpoint import Endpoint
+from catstream.wire.messages import End, Features, Health, Track, run_state
 from catstream.wire.newest import GapCounter, Subscriber
 
 CHECK_SECONDS = 0.2  #: between two checks whether the pipeline has rejected the keys or removed its sockets, or moved

@@ -35,10 +35,10 @@ from types import MappingProxyType
 
 import numpy as np
 
+from catstream.base import kalman
+from catstream.base.kalman import TRANSITION
 from catstream.base.settings import BeliefSettings
-from catstream.messages.kinds import DetectorState, Level, Motion
-from catstream.numerics import kalman
-from catstream.numerics.kalman import TRANSITION
+from catstream.wire.messages import DetectorState, Level, Motion
 
 _COASTING = TRANSITION @ np.diag([1, 1, 0.8, 0.8])  # a lost object coasts 0.8 + 0.8**2 + ... = 4 frames far
 _JUMP = 6.0  # Mahalanobis distance beyond which a measured centre resets the filter

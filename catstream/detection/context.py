@@ -8,7 +8,7 @@ from catstream.base.box import Window
 from catstream.base.settings import Settings
 from catstream.features.pyramid import Pyramid, Region
 from catstream.features.score_map import ScoreMap
-from catstream.messages.kinds import Model
+from catstream.wire.messages import Model
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -24,10 +24,10 @@ from catstream.errors import BoxError
 from catstream.features.cells import Cells
 from catstream.features.layout import WINDOW
 from catstream.features.pyramid import Pyramid
-from catstream.messages.kinds import DetectorState, Model, ObjectFeatures, State, Track
+from catstream.wire.messages import DetectorState, Model, ObjectFeatures, State, Track
 
 if TYPE_CHECKING:
-    from catstream.paper.scm import SparseCollaborativeModel
+    from catstream.detection.scm import SparseCollaborativeModel
 
 #: The track and the features of an object in one frame.
 Result = tuple[Track, ObjectFeatures]
@@ -79,7 +79,7 @@ class Detector:
         window = Window.around(box)
         seed = (self.settings.run.seed, seq - 1)
         if self.settings.training.bootstrap == "scm":
-            from catstream.paper.scm import SparseCollaborativeModel  # compiles a kernel of its own
+            from catstream.detection.scm import SparseCollaborativeModel  # compiles a kernel of its own
 
             scm = SparseCollaborativeModel(frame.image, box, np.random.default_rng(seed))
         model, training = teacher.first_training(frame, window, np.random.default_rng(seed), self.settings)

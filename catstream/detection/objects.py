@@ -20,7 +20,7 @@ from catstream.detection.search import Detection
 from catstream.detection.similarity import Similarity
 from catstream.errors import ObjectError
 from catstream.features.pyramid import Pyramid
-from catstream.messages.kinds import DetectorState, Features, Model, Track, Tracks
+from catstream.wire.messages import DetectorState, Features, Model, Track, Tracks
 
 _SAME_POSITION = 0.5  # IoU above which two boxes are at the same position
 _PART = 1 / 3  # share of a box that is inside another one, above which the one is at a part of the other
@@ -36,7 +36,7 @@ class Detectors:
 
     def __init__(self, settings: Settings) -> None:
         if settings.training.bootstrap == "scm":  # two seconds, for sklearn: before there is a frame
-            import catstream.paper.scm  # noqa: F401
+            import catstream.detection.scm  # noqa: F401
         self.settings, self.seq = settings, 0
         self.detectors: dict[str, Detector] = {}
 

@@ -19,8 +19,8 @@ from catstream.detection.similarity import MIN_SIMILARITY, Similarity
 from catstream.features.layout import WINDOW
 from catstream.features.pyramid import Region
 from catstream.features.score_map import ScoreMap, vertex
-from catstream.messages.heads import ASPECT, EXTENT, SIZE
-from catstream.messages.kinds import DetectorState
+from catstream.wire.heads import ASPECT, EXTENT, SIZE
+from catstream.wire.messages import DetectorState
 
 _MAX_CELLS = 16_384  # limit of a search of the whole frame in one frame, over all sizes: about 14 ms
 _FINE_SIDE = WINDOW + 2  # cells searched at each size: the best position may be a cell away from that at another size

@@ -15,6 +15,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
+from catstream.base import ridge
 from catstream.base.box import Box, Window
 from catstream.base.settings import Settings, TrainingSettings
 from catstream.detection import extent
@@ -26,9 +27,8 @@ from catstream.features.cells import window_rows
 from catstream.features.layout import CELL, COLOURS, MARGIN, WINDOW
 from catstream.features.pyramid import Pyramid
 from catstream.features.score_map import ScoreMap, non_maximum_suppression
-from catstream.messages.heads import APPEARANCE, DISCRIMINANT_RIDGE, EXTENT
-from catstream.messages.kinds import Model, TrainingRows
-from catstream.numerics import ridge
+from catstream.wire.heads import APPEARANCE, DISCRIMINANT_RIDGE, EXTENT
+from catstream.wire.messages import Model, TrainingRows
 
 #: Training rows by group, as in `Features`; a group without rows is left out.
 Training = dict[str, TrainingRows]

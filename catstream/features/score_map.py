@@ -10,7 +10,7 @@ from catstream.base.box import Window
 from catstream.features.cells import Cells
 from catstream.features.layout import WINDOW
 from catstream.features.pyramid import Pyramid, Region
-from catstream.messages.kinds import Model
+from catstream.wire.messages import Model
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -19,6 +19,7 @@ from pathlib import Path
 from catstream.base.addresses import is_live, without_password
 from catstream.client.address import Address
 from catstream.client.attach import control
+from catstream.client.saved_model import SavedModel
 from catstream.errors import (
     CatstreamError,
     CommandRejectedError,
@@ -29,16 +30,15 @@ from catstream.errors import (
 )
 from catstream.fleet.spec import StreamSpec
 from catstream.fleet.store import Claim, Store
-from catstream.jobs.saved_model import SavedModel
-from catstream.jobs.state import DESIRED, files, restore
-from catstream.messages.kinds import StreamState, StreamStatus, Track
-from catstream.messages.storage import Metadata
+from catstream.output.destinations import Origin, TrackedFrame
+from catstream.output.events import check_zones
+from catstream.output.track_log import OpenFiles, RunFiles, is_log
 from catstream.pipeline import Pipeline
-from catstream.sinks.destinations import Origin, TrackedFrame
-from catstream.sinks.events import check_zones
-from catstream.sinks.track_log import OpenFiles, RunFiles, is_log
+from catstream.processes.state import DESIRED, files, restore
 from catstream.wire.discovery import free_ports, private_folder
 from catstream.wire.keys import Client, ensure, public_key, synchronise
+from catstream.wire.messages import StreamState, StreamStatus, Track
+from catstream.wire.storage import Metadata
 
 FIRST_PAUSE_SECONDS = 1.0  # before a stream that failed starts again; doubled each time
 LONGEST_PAUSE_SECONDS = 60.0  # the most of these

@@ -26,8 +26,8 @@ from catstream.fleet.actor import Stream
 from catstream.fleet.registry import RegistryServer
 from catstream.fleet.spec import FleetSpec, StreamSpec, from_json, to_json
 from catstream.fleet.store import Store
-from catstream.messages.kinds import FleetStatus, NodeStatus, StreamStatus
 from catstream.wire.keys import Client, clients, ensure
+from catstream.wire.messages import FleetStatus, NodeStatus, StreamStatus
 
 #: Namespace of the named actors of all fleets.
 NAMESPACE = "catstream"

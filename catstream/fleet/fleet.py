@@ -42,13 +42,13 @@ import psutil
 
 from catstream.base.files import is_locked, lock, state_home, write_atomically
 from catstream.client.registry import REGISTRY_PORT
+from catstream.client.saved_model import SavedModel
 from catstream.errors import CatstreamError, FleetError, require_fleet
 from catstream.fleet.controller import NAMESPACE, Controller, actor_name, named_actors
 from catstream.fleet.spec import FleetSpec, StreamSpec
 from catstream.fleet.store import Store
-from catstream.jobs.saved_model import SavedModel
-from catstream.messages.kinds import FleetStatus
 from catstream.wire.discovery import private_folder
+from catstream.wire.messages import FleetStatus
 
 ANSWER_SECONDS = 60.0  # limit for the controller to answer; Ray starts it again meanwhile, if it has died
 DOWN_SECONDS = 60.0  # limit for all streams to store their state and to end

@@ -8,10 +8,10 @@ from dataclasses import replace
 
 import msgspec
 
-from catstream.messages.kinds import FleetStatus, Listing, Question
 from catstream.wire.channels import REGISTRY
 from catstream.wire.commands import Responder
 from catstream.wire.discovery import private_folder, reserve_endpoint
+from catstream.wire.messages import FleetStatus, Listing, Question
 
 
 class RegistryServer:

@@ -26,9 +26,9 @@ from catstream.base.names import UNNAMED, boxes_by_name, by_name
 from catstream.base.settings import Settings, flat, read_toml
 from catstream.base.text import listed
 from catstream.errors import CatstreamError, FleetError, errors_in
-from catstream.jobs.job import Job, changed_setting
-from catstream.sinks.destinations import SinkOptions, redacted
-from catstream.sinks.options import KEYS, destinations
+from catstream.output.destinations import SinkOptions, redacted
+from catstream.output.options import KEYS, destinations
+from catstream.processes.job import Job, changed_setting
 
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,63}")
 _HOST_AND_PORT = Annotated[str, Meta(pattern=r"^([A-Za-z0-9_.-]+:[0-9]{1,5})?$")]

@@ -45,7 +45,7 @@ import numpy as np
 from catstream.base.names import UNNAMED, check_name
 from catstream.errors import FencedError, FleetError, ProtocolError, StoreError, require_fleet
 from catstream.fleet.spec import check_fleet_name
-from catstream.messages import storage
+from catstream.wire import storage
 
 STORE_SECONDS = 10.0  # limit of a request to a server
 _CONNECT_SECONDS = 3.0  # limit to connect to it

@@ -7,18 +7,18 @@ from dataclasses import dataclass
 
 from catstream.base.names import check_count
 from catstream.base.text import listed
+from catstream.client.saved_model import SavedModel
 from catstream.detection.detector import Result
 from catstream.detection.objects import Detectors
 from catstream.errors import BoxError, ObjectError
 from catstream.features.pyramid import Pyramid
-from catstream.jobs.saved_model import SavedModel
-from catstream.messages.kinds import Answer, Command, Model
 from catstream.processes.commands import Commands
 from catstream.processes.control_commands import answer, check_room, continues, object_of
 from catstream.processes.decisions import DesiredObject, Start
 from catstream.processes.outputs import Previews
 from catstream.processes.process import Process
 from catstream.video.frames import Frame
+from catstream.wire.messages import Answer, Command, Model
 
 
 @dataclass(frozen=True, slots=True, eq=False)

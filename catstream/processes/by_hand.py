@@ -16,7 +16,7 @@ from pathlib import Path
 from catstream.base.names import boxes_by_name, split_name
 from catstream.base.settings import Settings
 from catstream.errors import CatstreamError, ObjectError
-from catstream.jobs.job import Job, files_by_name
+from catstream.processes.job import Job, files_by_name
 from catstream.processes.process import run
 
 _ABOUT = {

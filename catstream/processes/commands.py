@@ -8,18 +8,18 @@ from dataclasses import replace
 from time import monotonic
 
 from catstream.base.files import writing
+from catstream.client.saved_model import SavedModel
 from catstream.detection.objects import Detectors
 from catstream.errors import CatstreamError, ProtocolError, ServiceError
-from catstream.jobs.job import Job
-from catstream.jobs.saved_model import SavedModel
-from catstream.jobs.state import DESIRED, SEARCHED
-from catstream.messages.kinds import Answer, Command
 from catstream.processes.control_commands import STOPPED, answer, execute
 from catstream.processes.decisions import DesiredObject, DesiredState, Start
+from catstream.processes.job import Job
 from catstream.processes.model_files import ModelFiles
 from catstream.processes.process import Process
+from catstream.processes.state import DESIRED, SEARCHED
 from catstream.wire.channels import CONTROL
 from catstream.wire.commands import Responder
+from catstream.wire.messages import Answer, Command
 
 _RETRY_SECONDS = 5.0  # from one attempt to store the desired state to the next
 

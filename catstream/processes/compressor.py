@@ -7,19 +7,19 @@ from contextlib import ExitStack
 from dataclasses import replace
 from time import monotonic
 
+from catstream.base import ridge
 from catstream.base.settings import Settings
-from catstream.compression.checkpoint_store import CheckpointStore
-from catstream.compression.compressor import Compressor
+from catstream.client.saved_model import SavedModel, continued
+from catstream.coreset.checkpoint_store import CheckpointStore
+from catstream.coreset.compressor import Compressor
 from catstream.errors import ServiceError
-from catstream.jobs.saved_model import SavedModel, continued
-from catstream.jobs.state import CHECKPOINTS, locked
-from catstream.messages.kinds import End, Features, ModelFile, Position
-from catstream.numerics import ridge
 from catstream.processes.decisions import checkpoint_is_due, stored, sync_interval, with_end
 from catstream.processes.process import MESSAGE_SECONDS, Process
+from catstream.processes.state import CHECKPOINTS, locked
 from catstream.wire.acknowledged import Receiver
 from catstream.wire.channels import ALL_FEATURES, SAMPLES, SAVED_MODELS
 from catstream.wire.endpoint import Endpoint
+from catstream.wire.messages import End, Features, ModelFile, Position
 from catstream.wire.newest import Publisher
 
 _LOCK_SECONDS = 10.0  # limit for an earlier compressor to end

@@ -7,11 +7,11 @@ from dataclasses import dataclass, replace
 
 from catstream.base.names import UNNAMED, check_count, check_name
 from catstream.base.text import listed
+from catstream.client.saved_model import check_sizes
 from catstream.detection.objects import Detectors
 from catstream.errors import ObjectError
-from catstream.jobs.saved_model import check_sizes
-from catstream.messages.kinds import Answer, Command
 from catstream.processes.decisions import DesiredObject, DesiredState
+from catstream.wire.messages import Answer, Command
 
 #: The reason of a stream's end, if a command stopped it.
 STOPPED = "it was stopped by a command"

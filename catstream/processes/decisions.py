@@ -16,7 +16,7 @@ import msgspec
 from catstream.base.box import Box
 from catstream.base.files import write_atomically
 from catstream.errors import ProtocolError
-from catstream.messages.kinds import DetectorState, Position
+from catstream.wire.messages import DetectorState, Position
 
 _MOST_SAMPLES = 65536  # changes of the newest samples that are remembered until they are due
 _SYNC_SECONDS = 60.0  # shortest time between two checkpoints that are forced to disk

@@ -16,12 +16,11 @@ from time import monotonic, sleep, time
 
 import cv2
 
+from catstream.base import ridge
 from catstream.base.addresses import is_live, without_password
 from catstream.detection.objects import Detectors
 from catstream.errors import VideoError
 from catstream.features.pyramid import Pyramid
-from catstream.messages.kinds import Features, Model, Track, Tracks, run_state
-from catstream.numerics import ridge
 from catstream.processes.beginnings import Beginning, Beginnings
 from catstream.processes.commands import Commands
 from catstream.processes.decisions import TrainingLag, have_arrived, resume_at
@@ -32,6 +31,7 @@ from catstream.video import source as video_source
 from catstream.video.frames import Frame, Source, read_ahead
 from catstream.video.source import open_source
 from catstream.wire.channels import MODELS
+from catstream.wire.messages import Features, Model, Track, Tracks, run_state
 from catstream.wire.newest import Subscriber
 
 _SKIP_SECONDS = 0.1  # limit for decoding a skipped frame

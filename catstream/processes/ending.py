@@ -10,7 +10,7 @@ import math
 import signal
 import time
 
-from catstream.messages.kinds import End
+from catstream.wire.messages import End
 
 
 class Ending:

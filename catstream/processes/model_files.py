@@ -8,8 +8,8 @@ from hashlib import blake2b
 from pathlib import Path
 
 from catstream.base.files import write_atomically
+from catstream.client.saved_model import SavedModel
 from catstream.errors import CatstreamError
-from catstream.jobs.saved_model import SavedModel
 from catstream.processes.decisions import DesiredObject
 
 _log = logging.getLogger(__name__)

@@ -10,12 +10,12 @@ from time import monotonic, sleep
 
 from catstream.base.addresses import is_live
 from catstream.base.box import Box
-from catstream.messages.kinds import End, Features, Preview, Tracks
 from catstream.processes.process import TURN_SECONDS, Process
 from catstream.video.frames import Frame, jpeg
 from catstream.wire.acknowledged import Sender
 from catstream.wire.channels import ALL_FEATURES, FEATURES, PREVIEWS, TRACKS
 from catstream.wire.endpoint import Endpoint
+from catstream.wire.messages import End, Features, Preview, Tracks
 from catstream.wire.newest import Publisher
 from catstream.wire.results import ResultsSender
 

@@ -19,13 +19,13 @@ from secrets import token_hex
 from catstream.base.addresses import is_live, without_password
 from catstream.base.workers import die_with, name_process, release_memory
 from catstream.errors import CatstreamError, StreamRewoundError
-from catstream.jobs.job import Job
-from catstream.messages.kinds import Health, run_state
 from catstream.processes.ending import Ending
+from catstream.processes.job import Job
 from catstream.processes.shared import SharedMemory
 from catstream.wire.channels import HEALTH
 from catstream.wire.discovery import private_folder
 from catstream.wire.endpoint import Endpoint
+from catstream.wire.messages import Health, run_state
 from catstream.wire.newest import Publisher, Subscriber
 from catstream.wire.rejects import rejected
 

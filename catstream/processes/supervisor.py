@@ -21,13 +21,13 @@ from typing import BinaryIO
 from catstream.base.addresses import is_live
 from catstream.base.clock import RunningClock
 from catstream.errors import ServiceError, VideoError
-from catstream.jobs.job import Job
-from catstream.messages.kinds import End, Health, Track, Tracks
+from catstream.processes.job import Job
 from catstream.processes.process import PERMANENT_FAILURE, SOURCE_FAILED, STOPPED_EARLY, TURN_SECONDS
 from catstream.processes.shared import SharedMemory
 from catstream.processes.start_server import NAMES, StartedProcess, start_server, starting
 from catstream.wire.channels import HEALTH
 from catstream.wire.endpoint import Endpoint
+from catstream.wire.messages import End, Health, Track, Tracks
 from catstream.wire.newest import Subscriber
 from catstream.wire.results import ResultsReceiver
 

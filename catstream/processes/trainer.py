@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from threading import Thread
 
-from catstream.messages.kinds import End
 from catstream.processes.process import MESSAGE_SECONDS, Process
 from catstream.training import motion_em
 from catstream.training.trainer import Trainer
 from catstream.wire.channels import MODELS, SAMPLES
+from catstream.wire.messages import End
 from catstream.wire.newest import Publisher, Subscriber
 
 _NONE = {"version": 0.0, "trained": 0.0}

@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 
 from catstream.base.arrays import Bool, Float64
-from catstream.messages.kinds import Motion
-from catstream.numerics.kalman import OBSERVATION, TRANSITION
+from catstream.base.kalman import OBSERVATION, TRANSITION
+from catstream.wire.messages import Motion
 
 FEWEST = 8  #: centres that 13 free parameters can be estimated from
 PROCESS_FLOOR = 1e-4  #: smallest variance of the process, pixels squared: 0.01 pixels a frame

@@ -15,12 +15,12 @@ from functools import lru_cache
 
 import numpy as np
 
+from catstream.base import ridge
 from catstream.base.settings import Settings
 from catstream.errors import ProtocolError
-from catstream.messages.heads import DISCRIMINANT_RIDGE, TREES, Head, Tree
-from catstream.messages.kinds import Model, Motion, Sample
-from catstream.numerics import ridge
 from catstream.training.motion_em import learn_motion
+from catstream.wire.heads import DISCRIMINANT_RIDGE, TREES, Head, Tree
+from catstream.wire.messages import Model, Motion, Sample
 
 
 class Trainer:
@@ -57,7 +57,7 @@ class Trainer:
     def _directions(self, sample: Sample) -> list[np.ndarray]:
         settings = self.settings
         if settings.training.classifier == "one-class":
-            from catstream.paper.one_class import one_class  # two seconds, for sklearn
+            from catstream.training.one_class import one_class  # two seconds, for sklearn
 
             return [one_class(sample.trees["object"].rows, sample.trees["background"].mean)]
         if settings.training.classifier == "least-squares":

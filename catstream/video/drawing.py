@@ -12,8 +12,8 @@ import numpy as np
 
 from catstream.base.box import Box
 from catstream.base.names import UNNAMED
-from catstream.messages.kinds import Preview, Track
 from catstream.video.frames import jpeg
+from catstream.wire.messages import Preview, Track
 
 #: Colours as #rrggbb: distinguishable for colour-blind people, and light enough for dark text on them. In a picture,
 #: draw each beside a dark line, so that it is visible on a light ground too.

@@ -24,12 +24,12 @@ from starlette.responses import FileResponse, JSONResponse, Response
 from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 
-from catstream.annotation.keyframes import HIDDEN, KeyframeBox
-from catstream.annotation.session import Session, Sessions
 from catstream.base.arrays import Bool
 from catstream.base.box import Box
 from catstream.base.names import check_name
 from catstream.errors import CatstreamError, CommandRejectedError
+from catstream.offline.keyframes import HIDDEN, KeyframeBox
+from catstream.offline.session import Session, Sessions
 from catstream.video.drawing import PALETTE
 from catstream.video.frames import describe_counters, jpeg
 from catstream.web.app import PAGE, UPDATE_SECONDS, endless, event, failed, json_of

@@ -173,7 +173,7 @@ def event(parts: dict[str, object]) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """A command of the page: the fields of `catstream.messages.kinds.Command` that it may set."""
+    """A command of the page: the fields of `catstream.wire.messages.Command` that it may set."""
 
     verb: Literal["set-box", "forget", "pause", "resume", "stop"]
     object: str = ""

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 from itertools import takewhile
 from typing import Literal, TypeVar
 
-from catstream.messages.heads import TREES
-from catstream.messages.kinds import (
+from catstream.video.drawing import Colours
+from catstream.wire.heads import TREES
+from catstream.wire.messages import (
     End,
     Health,
     Model,
@@ -17,7 +18,6 @@ from catstream.messages.kinds import (
     Track,
     run_state,
 )
-from catstream.video.drawing import Colours
 
 Key = TypeVar("Key")
 Value = TypeVar("Value")

@@ -19,11 +19,11 @@ from catstream.client.address import Address
 from catstream.client.control import Control
 from catstream.client.subscription import Subscription
 from catstream.errors import CatstreamError, SilenceError
-from catstream.messages.kinds import Answer, End
 from catstream.web.dashboard import Dashboard
 from catstream.web.latency import Latency
 from catstream.wire.channels import CHANNELS
 from catstream.wire.endpoint import Endpoint
+from catstream.wire.messages import Answer, End
 
 _log = logging.getLogger(__name__)
 

@@ -6,7 +6,7 @@ from time import time
 
 from prometheus_client import Histogram
 
-from catstream.messages.kinds import Health, Track
+from catstream.wire.messages import Health, Track
 
 _LATENCIES = (0.01, 0.02, 0.03, 0.05, 0.07, 0.1, 0.15, 0.2, 0.3, 0.5, 1.0, 2.0, 5.0)  # bounds of the histogram, seconds
 

@@ -15,9 +15,9 @@ from time import monotonic, time
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, disable_created_metrics, generate_latest
 from starlette.responses import Response
 
-from catstream.messages.heads import TREES
-from catstream.messages.kinds import FleetStatus, NodeStatus, StreamStatus
 from catstream.web.feed import PipelineFeed
+from catstream.wire.heads import TREES
+from catstream.wire.messages import FleetStatus, NodeStatus, StreamStatus
 
 # Each counter would have another metric with the time of its first sample.
 disable_created_metrics()  # type: ignore[no-untyped-call]

@@ -30,10 +30,10 @@ from starlette.types import Receive, Scope, Send
 from catstream.client.address import Address
 from catstream.client.registry import Registry, described
 from catstream.errors import CatstreamError
-from catstream.messages.kinds import FleetStatus, NodeStatus, StreamStatus
 from catstream.web import prometheus
 from catstream.web.app import PAGE, Site
 from catstream.web.feed import PipelineFeed
+from catstream.wire.messages import FleetStatus, NodeStatus, StreamStatus
 
 PERIOD_SECONDS = 1.0  #: between two questions to the registry
 REGISTRY_SECONDS = 2.0  #: limit for its answer

@@ -18,10 +18,10 @@ from typing import Protocol, TypeVar
 import zmq
 
 from catstream.errors import ServiceError
-from catstream.messages.kinds import DetectorState, End, Position
 from catstream.wire.channels import Channel
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.go_back_n import PATIENCE_SECONDS, ReceiveWindow, SendWindow
+from catstream.wire.messages import DetectorState, End, Position
 from catstream.wire.monitor import Event
 from catstream.wire.socket import LINGER_SECONDS, ChannelSocket
 

@@ -27,7 +27,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Generic, Literal, TypeVar
 
-from catstream.messages.kinds import (
+from catstream.wire.messages import (
     Answer,
     Command,
     End,

@@ -7,7 +7,7 @@ A message is one frame of msgpack, `[version, kind, object, run, fields]`:
     object    name of the object that the message is about, "" if it is about none or about all
     run       id of the run that it is from: of one start of one pipeline, kept by processes that are restarted; "" if
               the sender knows none
-    fields    map from each field's name to its value, see `catstream.messages.kinds`
+    fields    map from each field's name to its value, see `catstream.wire.messages`
     a box     [x, y, w, h]
     an array  {"dtype": "<f4" | "<f8", "shape": [...], "data": bytes, row by row, little-endian}
 
@@ -29,9 +29,9 @@ import msgspec
 import numpy as np
 
 from catstream.errors import ProtocolError
-from catstream.messages.kinds import Position
-from catstream.messages.schema import LONGEST_LIST, LONGEST_TEXT, Integer, Text, check_message
 from catstream.wire.channels import CHANNELS, REGISTRY
+from catstream.wire.messages import Position
+from catstream.wire.schema import LONGEST_LIST, LONGEST_TEXT, Integer, Text, check_message
 
 Message = TypeVar("Message")
 
@@ -124,7 +124,7 @@ def opening(kind: type, about: str | None = None) -> bytes:
 def topic_of(data: bytes) -> Topic:
     """The topic of a message, by its first bytes; of no kind if they do not begin a message.
 
-    >>> from catstream.messages.kinds import End
+    >>> from catstream.wire.messages import End
     >>> topic_of(encode(End(0, "over")))
     Topic(kind='end', object='')
     """

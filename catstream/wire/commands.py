@@ -16,10 +16,10 @@ from typing import Generic, Protocol, TypeVar, cast
 import zmq
 
 from catstream.base.clock import RunningClock
-from catstream.messages.kinds import Answer as CommandAnswer
-from catstream.messages.kinds import Command
 from catstream.wire.channels import Channel
 from catstream.wire.endpoint import Endpoint
+from catstream.wire.messages import Answer as CommandAnswer
+from catstream.wire.messages import Command
 from catstream.wire.socket import ChannelSocket
 
 LOOK_SECONDS = 0.05  #: from one look at the connection to the next

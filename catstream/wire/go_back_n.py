@@ -28,7 +28,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from catstream.errors import ProtocolError, StreamRewoundError
-from catstream.messages.kinds import Position
+from catstream.wire.messages import Position
 
 PATIENCE_SECONDS = 0.2  #: without a reply, after which a sender asks for the position; between two reports of a gap
 AGAIN_SECONDS = 2.0  #: within which a sender goes back once only on the same connection

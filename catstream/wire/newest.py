@@ -19,10 +19,10 @@ from typing import TypeVar
 
 import zmq
 
-from catstream.messages.kinds import End, Features, Health, Track
 from catstream.wire.channels import Channel
 from catstream.wire.codec import Topic, opening, topic_of
 from catstream.wire.endpoint import Endpoint
+from catstream.wire.messages import End, Features, Health, Track
 from catstream.wire.monitor import arrives
 from catstream.wire.socket import ChannelSocket
 

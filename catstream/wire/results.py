@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import zmq
 
-from catstream.messages.kinds import End, Tracks
 from catstream.wire.channels import RESULTS
 from catstream.wire.endpoint import Endpoint
+from catstream.wire.messages import End, Tracks
 from catstream.wire.socket import ChannelSocket
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from catstream.base.names import boxes_by_name, by_name, check_name, split_name
 from catstream.errors import ObjectError
-from catstream.messages.schema import ObjectName
+from catstream.wire.schema import ObjectName
 
 NAMES = [
     "anna-2",

@@ -8,7 +8,7 @@ import table
 
 from catstream.base.box import Box
 from catstream.base.settings import Settings
-from catstream.evaluation.scores import score
+from catstream.measure.scores import score
 
 pytestmark = pytest.mark.system
 

@@ -69,7 +69,7 @@ def test_existing_results_are_replaced_with_overwrite_only(demo, fail, tmp_path,
 
 
 def test_ctrl_c_keeps_the_boxes_and_the_finished_tracks(demo, said, tmp_path, monkeypatch):
-    from catstream.annotation.annotation import Annotation
+    from catstream.offline.annotation import Annotation
 
     def interrupted(_):
         raise KeyboardInterrupt

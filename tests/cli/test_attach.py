@@ -11,9 +11,9 @@ import pytest
 from catstream.cli.status import Status
 from catstream.client.attach import control
 from catstream.features.layout import ROW_LENGTH
-from catstream.messages.kinds import Health, Track
 from catstream.pipeline import Pipeline
 from catstream.processes.start_server import NAMES
+from catstream.wire.messages import Health, Track
 
 SECONDS = 60  # that anything may take on a busy machine
 

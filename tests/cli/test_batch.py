@@ -11,7 +11,7 @@ import pytest
 
 from catstream import MultiTracker
 from catstream.batch import read_videos
-from catstream.sinks.track_log import Log
+from catstream.output.track_log import Log
 from catstream.video.source import open_source
 
 FRAMES = 12

@@ -11,7 +11,7 @@ import pytest
 from catstream.base.box import Box
 from catstream.cli.common import Interrupts
 from catstream.cli.progress import RunProgress
-from catstream.messages.kinds import Track
+from catstream.wire.messages import Track
 
 SIGNALS = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
 

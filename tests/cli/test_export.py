@@ -10,8 +10,8 @@ import cv2
 import pytest
 
 from catstream.base.box import Box
-from catstream.messages.kinds import Track
-from catstream.sinks.destinations import Head
+from catstream.output.destinations import Head
+from catstream.wire.messages import Track
 
 
 def test_other_formats_are_made_from_the_log_of_a_run(whole_run, video, succeed, fail, tmp_path):

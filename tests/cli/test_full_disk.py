@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from catstream.sinks.track_log import Log
+from catstream.output.track_log import Log
 
 #: Bytes of a disk for some of the messages of a short video, and of one for its rows but not for all.
 SMALL, TINY = 1 << 20, 1 << 16

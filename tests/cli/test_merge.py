@@ -3,7 +3,7 @@
 import pytest
 
 from catstream.base.box import Box
-from catstream.jobs.saved_model import SavedModel
+from catstream.client.saved_model import SavedModel
 from tests.learning import learned_from
 
 #: A part of the background of the demo video.

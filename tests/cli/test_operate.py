@@ -9,7 +9,7 @@ from threading import Event
 import pytest
 
 from catstream.base.box import Box
-from catstream.jobs.saved_model import SavedModel
+from catstream.client.saved_model import SavedModel
 from catstream.pipeline import Pipeline
 from tests.learning import learned_from
 

@@ -10,9 +10,9 @@ import pytest
 
 from catstream.base.box import Box
 from catstream.errors import VideoError
-from catstream.messages.kinds import Track
-from catstream.sinks.destinations import Head
+from catstream.output.destinations import Head
 from catstream.video.source import open_source
+from catstream.wire.messages import Track
 
 STATES = "PPPPDDAAPP"  # present, doubtful, absent
 

@@ -11,10 +11,10 @@ from pathlib import Path
 
 from catstream.base.box import Box
 from catstream.base.text import counted
-from catstream.messages.kinds import Health, Track
 from catstream.pipeline import Pipeline
 from catstream.video.source import open_source
 from catstream.wire.channels import HEALTH, TRACKS
+from catstream.wire.messages import Health, Track
 from catstream.wire.newest import Publisher
 
 FILES = ["tracks.ndjson", "t.csv", "walk.mp4"]

@@ -17,9 +17,9 @@ import pytest
 from catstream.base.box import Box
 from catstream.cli import progress as progress_module
 from catstream.cli.progress import RunProgress
-from catstream.jobs.saved_model import SavedModel
+from catstream.client.saved_model import SavedModel
+from catstream.output.track_log import Log
 from catstream.pipeline import Pipeline
-from catstream.sinks.track_log import Log
 from catstream.video.source import open_source
 
 FILES = ["demo.csv", "demo.mp4", "demo.ndjson"]

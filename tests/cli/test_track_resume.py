@@ -13,11 +13,11 @@ import pytest
 
 from catstream.base.box import Box
 from catstream.base.settings import Settings
-from catstream.compression.checkpoint_store import CheckpointStore
-from catstream.jobs.job import Job
-from catstream.jobs.saved_model import SavedModel
-from catstream.jobs.state import CHECKPOINTS
+from catstream.client.saved_model import SavedModel
+from catstream.coreset.checkpoint_store import CheckpointStore
 from catstream.pipeline import Pipeline
+from catstream.processes.job import Job
+from catstream.processes.state import CHECKPOINTS
 from catstream.video.source import open_source
 
 UNITS = Path(__file__).parents[2] / "services"

@@ -11,10 +11,10 @@ import pytest
 import catstream
 from catstream.client.subscription import DRAIN_SECONDS
 from catstream.errors import ServiceError, SilenceError
-from catstream.messages.kinds import End, FleetStatus, StreamStatus
 from catstream.wire.channels import TRACKS
 from catstream.wire.discovery import private_folder
 from catstream.wire.endpoint import Endpoint
+from catstream.wire.messages import End, FleetStatus, StreamStatus
 from catstream.wire.newest import Publisher
 from tests.wire.examples import present as track
 

@@ -10,11 +10,11 @@ import pytest
 from catstream.client.address import Address
 from catstream.client.registry import Registry
 from catstream.errors import ServiceError, SilenceError
-from catstream.messages.kinds import FleetStatus, Listing, NodeStatus, Question, StreamStatus
 from catstream.wire.channels import REGISTRY
 from catstream.wire.commands import Responder
 from catstream.wire.discovery import find, fleets, reserve_endpoint, running
 from catstream.wire.keys import Client, Keys, allow, clients, create, synchronise
+from catstream.wire.messages import FleetStatus, Listing, NodeStatus, Question, StreamStatus
 from catstream.wire.rejects import rejected
 
 CAM = StreamStatus("cam-7", "running", "north", "walk.mp4", "run", token=3)

@@ -12,10 +12,10 @@ import zmq
 
 import catstream
 from catstream.errors import ObjectError, ServiceError, SilenceError
-from catstream.messages.kinds import End, Features, Health, ObjectFeatures, TrainingRows
 from catstream.wire import socket
 from catstream.wire.channels import FEATURES, HEALTH, MODELS, TRACKS
 from catstream.wire.discovery import reserve_endpoint
+from catstream.wire.messages import End, Features, Health, ObjectFeatures, TrainingRows
 from catstream.wire.newest import Publisher
 from tests.wire.examples import model
 from tests.wire.examples import present as track

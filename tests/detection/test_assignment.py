@@ -16,7 +16,7 @@ from catstream.detection.search import Detection, local_search
 from catstream.features.layout import WINDOW
 from catstream.features.pyramid import Pyramid
 from catstream.features.score_map import ScoreMap
-from catstream.messages.kinds import DetectorState, Model
+from catstream.wire.messages import DetectorState, Model
 
 
 def state(x, first_frame=0):

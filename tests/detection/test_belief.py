@@ -11,7 +11,7 @@ from catstream.base.box import Window
 from catstream.base.settings import Settings
 from catstream.detection import belief
 from catstream.detection.belief import at_rest, predict, update
-from catstream.messages.kinds import DetectorState, Motion
+from catstream.wire.messages import DetectorState, Motion
 
 SETTINGS = Settings()
 BELIEF, TABLE = SETTINGS.belief, belief.policies(SETTINGS.search.full_interval)

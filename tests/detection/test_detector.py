@@ -14,8 +14,8 @@ from catstream.detection.similarity import MIN_SIMILARITY, Similarity
 from catstream.errors import BoxError
 from catstream.features.layout import ROW_LENGTH
 from catstream.features.pyramid import Pyramid
-from catstream.messages.heads import APPEARANCE, GROUPS
-from catstream.messages.kinds import Motion
+from catstream.wire.heads import APPEARANCE, GROUPS
+from catstream.wire.messages import Motion
 
 START = Box(60, 50, 48, 40)
 

@@ -10,7 +10,7 @@ from catstream.detection.search import due_part
 from catstream.features.cells import Cells
 from catstream.features.pyramid import Pyramid, Region
 from catstream.features.score_map import ScoreMap, non_maximum_suppression
-from catstream.messages.kinds import Model
+from catstream.wire.messages import Model
 
 
 def test_the_window_of_a_score_lies_in_the_frame_and_place_is_its_inverse(image):

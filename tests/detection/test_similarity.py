@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from catstream.compression.reduce import energy, reduce
+from catstream.coreset.reduce import energy, reduce
 from catstream.detection.similarity import Similarity
 
 WIDTH = 200

@@ -12,8 +12,8 @@ from catstream.features.cells import Cells
 from catstream.features.layout import COLOURS, ROW_LENGTH, WINDOW
 from catstream.features.pyramid import Pyramid
 from catstream.features.score_map import ScoreMap
-from catstream.messages.heads import APPEARANCE, EXTENT
-from catstream.messages.kinds import Model
+from catstream.wire.heads import APPEARANCE, EXTENT
+from catstream.wire.messages import Model
 
 OBJECT = Window(120, 80, 64, 64)
 SETTINGS = Settings()

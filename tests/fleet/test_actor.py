@@ -13,7 +13,7 @@ from catstream.fleet import actor as module
 from catstream.fleet.actor import Stream
 from catstream.fleet.spec import StreamSpec
 from catstream.fleet.store import Claim, Store
-from catstream.sinks import webhook
+from catstream.output import webhook
 from catstream.video.live_demo import first_box
 from catstream.video.source import open_source
 from catstream.wire import discovery

@@ -15,8 +15,8 @@ from catstream.fleet import controller as module
 from catstream.fleet.controller import Controller
 from catstream.fleet.spec import FleetSpec, StreamSpec, from_json
 from catstream.fleet.store import StateStore, Store
-from catstream.messages.kinds import StreamStatus
 from catstream.wire.keys import allow
+from catstream.wire.messages import StreamStatus
 
 GATE, ROOF = StreamSpec("gate", "demo:1"), StreamSpec("roof", "demo:2", cores=0.5)
 

@@ -12,18 +12,18 @@ import pytest
 
 from catstream.base.box import Box
 from catstream.base.settings import Settings
-from catstream.compression.checkpoint_store import CheckpointStore
+from catstream.coreset.checkpoint_store import CheckpointStore
 from catstream.errors import CatstreamError
-from catstream.jobs.job import Job
-from catstream.jobs.state import CHECKPOINTS
-from catstream.messages.kinds import End, Track
 from catstream.pipeline import Pipeline
 from catstream.processes import by_hand as scripts
+from catstream.processes.job import Job
 from catstream.processes.shared import RUNNING_SECONDS
 from catstream.processes.start_server import NAMES
+from catstream.processes.state import CHECKPOINTS
 from catstream.processes.supervisor import Child, Supervisor
 from catstream.wire.channels import TRACKS
 from catstream.wire.endpoint import Endpoint
+from catstream.wire.messages import End, Track
 from catstream.wire.newest import Subscriber
 
 

@@ -7,9 +7,9 @@ from itertools import islice
 import pytest
 
 from catstream.errors import ServiceError
-from catstream.jobs.state import DESIRED, files, position, restore
 from catstream.pipeline import Pipeline
 from catstream.processes.decisions import DesiredState
+from catstream.processes.state import DESIRED, files, position, restore
 from catstream.video.live_demo import first_box
 from tests.pipeline.conftest import share_found
 

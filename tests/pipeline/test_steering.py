@@ -9,7 +9,7 @@ import pytest
 
 from catstream.base.settings import Settings
 from catstream.client.attach import control, subscribe
-from catstream.jobs.saved_model import SavedModel
+from catstream.client.saved_model import SavedModel
 from catstream.multi import MultiTracker
 from catstream.pipeline import Pipeline
 from catstream.video.source import open_source

@@ -9,15 +9,15 @@ import pytest
 from catstream.base.box import Box
 from catstream.detection.objects import Detectors
 from catstream.features.pyramid import Pyramid
-from catstream.jobs.job import Job
-from catstream.jobs.state import DESIRED
-from catstream.messages.kinds import Command
 from catstream.processes.beginnings import Beginnings
 from catstream.processes.commands import Commands
 from catstream.processes.decisions import DesiredObject, DesiredState, Start
+from catstream.processes.job import Job
 from catstream.processes.outputs import Previews
 from catstream.processes.process import Process
+from catstream.processes.state import DESIRED
 from catstream.video.frames import Frame
+from catstream.wire.messages import Command
 
 BOX, OTHER = Box(60, 50, 48, 40), Box(10, 20, 30, 30)
 

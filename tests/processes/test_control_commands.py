@@ -9,9 +9,9 @@ from catstream.base.box import Box, Window
 from catstream.base.settings import Settings
 from catstream.detection.objects import Detectors
 from catstream.errors import CatstreamError, ObjectError, SettingsError
-from catstream.messages.kinds import LARGEST_GIVEN_MODEL, Command, DetectorState, Model
 from catstream.processes.control_commands import check_room, continues, execute, object_of
 from catstream.processes.decisions import DesiredObject, DesiredState
+from catstream.wire.messages import LARGEST_GIVEN_MODEL, Command, DetectorState, Model
 
 BOX, PLACE = Box(40, 30, 20, 20), Window(40, 30, 20, 20)
 SAVED = DesiredObject(BOX, 1, "digest", 1000, 5)

@@ -11,7 +11,6 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, ru
 
 from catstream.base.box import Box, Window
 from catstream.errors import ProtocolError
-from catstream.messages.kinds import DetectorState, Position
 from catstream.processes.decisions import (
     DesiredObject,
     DesiredState,
@@ -21,6 +20,7 @@ from catstream.processes.decisions import (
     with_end,
 )
 from catstream.wire.go_back_n import ReceiveWindow
+from catstream.wire.messages import DetectorState, Position
 
 BOX, PLACE = Box(1.0, 2.0, 30.0, 40.0), Window(40.0, 30.0, 20.0, 20.0)
 STATE = DetectorState(0, "weak", PLACE, PLACE, PLACE)

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from catstream.messages.kinds import End
 from catstream.processes.ending import Ending
+from catstream.wire.messages import End
 
 REASONS = st.lists(st.tuples(st.sampled_from(["the source has ended", "it was stopped"]), st.booleans()), max_size=4)
 

@@ -8,13 +8,13 @@ import pytest
 
 from catstream.base.box import Box
 from catstream.base.settings import Settings
-from catstream.jobs.job import Job
-from catstream.messages.kinds import Command
 from catstream.multi import MultiTracker
 from catstream.processes.detector import DetectorLoop
+from catstream.processes.job import Job
 from catstream.processes.model_files import ModelFiles
 from catstream.processes.process import Process
 from catstream.video.rendered import render
+from catstream.wire.messages import Command
 
 
 @pytest.fixture(scope="module")

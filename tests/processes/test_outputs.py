@@ -5,10 +5,10 @@ from dataclasses import replace
 
 import pytest
 
-from catstream.jobs.job import Job
-from catstream.messages.kinds import Features, Tracks
+from catstream.processes.job import Job
 from catstream.processes.outputs import Outputs
 from catstream.processes.process import Process
+from catstream.wire.messages import Features, Tracks
 from catstream.wire.results import ResultsReceiver
 
 

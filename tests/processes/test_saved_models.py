@@ -5,11 +5,11 @@ from unittest.mock import Mock
 import pytest
 
 from catstream.base.settings import Settings
-from catstream.compression.compressor import Compressor
-from catstream.jobs.saved_model import SavedModel
-from catstream.messages.kinds import ModelFile
+from catstream.client.saved_model import SavedModel
+from catstream.coreset.compressor import Compressor
 from catstream.processes.compressor import SavedModels
 from catstream.wire.channels import SAVED_MODELS
+from catstream.wire.messages import ModelFile
 from catstream.wire.newest import Subscriber
 from tests.learning import features
 

@@ -13,8 +13,8 @@ import psutil
 import pytest
 
 from catstream.errors import ServiceError
-from catstream.jobs.job import Job
 from catstream.processes import start_server as module
+from catstream.processes.job import Job
 from catstream.processes.process import STOPPED_EARLY
 from catstream.processes.shared import SharedMemory
 from catstream.processes.start_server import start_server

@@ -13,10 +13,10 @@ import pytest
 
 from catstream.base.box import Box
 from catstream.base.settings import Settings
+from catstream.detection.scm import SparseCollaborativeModel
 from catstream.errors import VideoError
-from catstream.evaluation.datasets import Sequence, find_sequences
-from catstream.evaluation.onepass import evaluate
-from catstream.paper.scm import SparseCollaborativeModel
+from catstream.measure.datasets import Sequence, find_sequences
+from catstream.measure.onepass import evaluate
 from catstream.video.source import open_source
 
 DATA = Path(os.environ.get("TRACKING_DATA") or Path(__file__).parents[3] / "shared" / "data")

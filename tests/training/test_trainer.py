@@ -7,12 +7,12 @@ import pytest
 
 from catstream.base.box import Box
 from catstream.base.settings import Settings
-from catstream.compression.compressor import Compressor
+from catstream.coreset.compressor import Compressor
 from catstream.detection.detector import Detector
 from catstream.errors import ProtocolError
 from catstream.features.pyramid import Pyramid
-from catstream.messages.kinds import Summary
 from catstream.training.trainer import Trainer
+from catstream.wire.messages import Summary
 
 
 @pytest.fixture(scope="module")

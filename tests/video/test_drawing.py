@@ -15,10 +15,10 @@ from hypothesis import strategies as some
 
 from catstream.base.box import Box
 from catstream.errors import VideoError
-from catstream.messages.kinds import State, Track
 from catstream.video.drawing import PALETTE, Colours, draw, drawn_size
 from catstream.video.source import open_source
 from catstream.video.writer import VideoWriter
+from catstream.wire.messages import State, Track
 
 BOX = Box(40, 30, 60, 40)
 

@@ -8,8 +8,8 @@ import av
 import numpy as np
 import pytest
 
-from catstream.loadtest import rtsp
-from catstream.loadtest.camera import Broadcast
+from catstream.measure import rtsp
+from catstream.measure.camera import Broadcast
 from catstream.video.nal_units import NalUnits
 from catstream.video.source import open_source
 from catstream.video.writer import Encoder

@@ -13,12 +13,12 @@ import pytest
 
 from catstream.base.box import Box
 from catstream.client.address import Address
-from catstream.messages.kinds import FleetStatus, Health, Model, NodeStatus, Preview, StreamStatus, Track
 from catstream.web.app import Site
 from catstream.web.feed import PipelineFeed
 from catstream.web.server import Server
 from catstream.web.wall import Wall
 from catstream.wire.channels import HEALTH, PREVIEWS
+from catstream.wire.messages import FleetStatus, Health, Model, NodeStatus, Preview, StreamStatus, Track
 from catstream.wire.newest import Publisher
 
 JPEG = b"\xff\xd8\xff\xe0 a picture"

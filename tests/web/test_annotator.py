@@ -9,8 +9,8 @@ import httpx
 import numpy as np
 import pytest
 
-from catstream.annotation.annotation import Annotation
-from catstream.annotation.session import Session, Sessions
+from catstream.offline.annotation import Annotation
+from catstream.offline.session import Session, Sessions
 from catstream.web import annotator as module
 from catstream.web.annotator import AnnotationSite
 

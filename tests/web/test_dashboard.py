@@ -9,11 +9,11 @@ from hypothesis import given
 from hypothesis import strategies as some
 
 from catstream.client.address import Address
-from catstream.messages.heads import TREES
-from catstream.messages.kinds import End, Health
 from catstream.video.drawing import PALETTE
 from catstream.web.dashboard import Dashboard
 from catstream.web.feed import SILENCE_SECONDS, PipelineFeed
+from catstream.wire.heads import TREES
+from catstream.wire.messages import End, Health
 
 
 @pytest.fixture

@@ -9,11 +9,11 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from catstream.base.settings import Settings
 from catstream.client.address import Address
-from catstream.compression.forest import Forest
-from catstream.messages.kinds import Health
+from catstream.coreset.forest import Forest
 from catstream.web import prometheus
 from catstream.web.feed import PipelineFeed
 from catstream.web.latency import Latency
+from catstream.wire.messages import Health
 
 
 @pytest.fixture

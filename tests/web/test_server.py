@@ -22,13 +22,13 @@ import pytest
 
 from catstream.client.address import Address
 from catstream.errors import ServiceError
-from catstream.messages.kinds import Health
 from catstream.web import app
 from catstream.web.app import Site
 from catstream.web.dashboard import Dashboard
 from catstream.web.feed import PipelineFeed
 from catstream.web.server import Server
 from catstream.wire.channels import HEALTH, PREVIEWS, TRACKS
+from catstream.wire.messages import Health
 from catstream.wire.newest import Publisher
 
 TOKEN = "correct-horse-battery"

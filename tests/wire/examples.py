@@ -5,8 +5,8 @@ from typing import Any, Literal, get_args, get_origin
 import numpy as np
 
 from catstream.base.box import Box, Window
-from catstream.messages.kinds import Command, Model, Preview, Track
-from catstream.messages.schema import Field, Named, fields
+from catstream.wire.messages import Command, Model, Preview, Track
+from catstream.wire.schema import Field, Named, fields
 
 
 def track(seq: int, name: str = "") -> Track:

@@ -17,7 +17,10 @@ from catstream.base.settings import Settings, describe
 from catstream.detection.objects import Detectors
 from catstream.errors import ProtocolError
 from catstream.features.pyramid import Pyramid
-from catstream.messages.kinds import (
+from catstream.video import rendered
+from catstream.wire.channels import CHANNELS
+from catstream.wire.codec import KINDS, VERSION, decode, encode
+from catstream.wire.messages import (
     LARGEST_GIVEN_MODELS,
     Command,
     Features,
@@ -28,10 +31,7 @@ from catstream.messages.kinds import (
     Track,
     TrainingRows,
 )
-from catstream.messages.schema import LARGEST_INTEGER, LONGEST_LIST, LONGEST_TEXT, Array, Field, fields
-from catstream.video import rendered
-from catstream.wire.channels import CHANNELS
-from catstream.wire.codec import KINDS, VERSION, decode, encode
+from catstream.wire.schema import LARGEST_INTEGER, LONGEST_LIST, LONGEST_TEXT, Array, Field, fields
 from tests.wire.examples import example as example_of
 
 

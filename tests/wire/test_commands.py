@@ -10,11 +10,11 @@ import zmq
 from catstream.base.box import Box
 from catstream.client.control import Control
 from catstream.errors import BoxError, CommandRejectedError, ServiceError
-from catstream.messages.kinds import Answer, Command
 from catstream.wire import commands
 from catstream.wire.channels import CHANNELS, CONTROL
 from catstream.wire.codec import decode, encode
 from catstream.wire.commands import Requester, Responder
+from catstream.wire.messages import Answer, Command
 from catstream.wire.rejects import rejected
 
 PAUSE = Command("one", "pause")

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
 from catstream.errors import ProtocolError, StreamRewoundError
-from catstream.messages.kinds import Position
 from catstream.wire.go_back_n import PATIENCE_SECONDS, ReceiveWindow, SendWindow
+from catstream.wire.messages import Position
 
 STRANGER = b"stranger"
 ASKS = b""  # the frame by which a sender asks for the position

@@ -12,13 +12,13 @@ import zmq
 import catstream
 from catstream.client.address import Address
 from catstream.errors import ServiceError
-from catstream.messages.kinds import Answer, Command, End, Features, Position
 from catstream.wire.acknowledged import Receiver, Sender
 from catstream.wire.channels import ALL_FEATURES, CHANNELS, CONTROL, TRACKS
 from catstream.wire.codec import encode
 from catstream.wire.commands import Requester, Responder
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.keys import ROLES, Keys, allow, clients, create
+from catstream.wire.messages import Answer, Command, End, Features, Position
 from catstream.wire.newest import Publisher, Subscriber
 from catstream.wire.rejects import rejected
 from catstream.wire.results import ResultsReceiver

@@ -10,12 +10,12 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
-from catstream.messages.kinds import End, Model, Sample, Summary, Track
 from catstream.wire import newest
 from catstream.wire.channels import MODELS, SAMPLES, TRACKS
 from catstream.wire.codec import encode, opening, topic_of
 from catstream.wire.discovery import private_folder
 from catstream.wire.endpoint import Endpoint
+from catstream.wire.messages import End, Model, Sample, Summary, Track
 from catstream.wire.newest import Publisher, Subscriber
 from catstream.wire.rejects import rejected
 from tests.wire.examples import model, track

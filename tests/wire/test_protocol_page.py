@@ -10,12 +10,12 @@ import msgpack
 import pytest
 
 from catstream.base.box import Box
-from catstream.messages.kinds import End, Question, Track
-from catstream.messages.schema import LONGEST_LIST, LONGEST_TEXT
 from catstream.wire import codec
 from catstream.wire.channels import CHANNELS, REGISTRY, TRACKS
 from catstream.wire.endpoint import Endpoint
+from catstream.wire.messages import End, Question, Track
 from catstream.wire.newest import Publisher
+from catstream.wire.schema import LONGEST_LIST, LONGEST_TEXT
 from tests.wire.examples import track
 
 DOCS = Path(__file__).parents[2] / "docs"

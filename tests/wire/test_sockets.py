@@ -17,10 +17,10 @@ import zmq
 
 import catstream
 from catstream.errors import ServiceError
-from catstream.messages.kinds import End, Position, Sample, Summary, Tracks
 from catstream.wire.acknowledged import Receiver, Sender
 from catstream.wire.channels import ALL_FEATURES, MODELS, RESULTS, SAMPLES, TRACKS
 from catstream.wire.endpoint import Endpoint
+from catstream.wire.messages import End, Position, Sample, Summary, Tracks
 from catstream.wire.monitor import Event, Monitor
 from catstream.wire.newest import Publisher, Subscriber
 from catstream.wire.socket import context
@@ -42,7 +42,7 @@ def test_a_message_that_is_too_large_to_arrive_is_an_error_that_says_what_to_giv
 #: Takes nothing while its queue is full and the sender dies, for longer than any timer of ZeroMQ.
 BUSY_RECEIVER = """
 import sys, time
-from catstream.messages.kinds import Position
+from catstream.wire.messages import Position
 from catstream.wire.acknowledged import Receiver
 from catstream.wire.channels import RESULTS
 from catstream.wire.endpoint import Endpoint
@@ -162,7 +162,7 @@ def test_too_many_open_files_are_an_error_that_names_the_limit(folder, open_file
 SENDER = """
 import sys
 import numpy as np
-from catstream.messages.kinds import Features, ObjectFeatures, Position, TrainingRows
+from catstream.wire.messages import Features, ObjectFeatures, Position, TrainingRows
 from catstream.wire.acknowledged import Sender
 from catstream.wire.channels import ALL_FEATURES
 from catstream.wire.endpoint import Endpoint

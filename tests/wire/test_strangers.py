@@ -9,11 +9,11 @@ import pytest
 import zmq
 
 from catstream.base.settings import Settings
-from catstream.compression.forest import Forest
-from catstream.messages.kinds import End, Features, Health, ObjectFeatures, Position, TrainingRows
+from catstream.coreset.forest import Forest
 from catstream.wire.acknowledged import Receiver, Sender
 from catstream.wire.channels import ALL_FEATURES, CHANNELS, RESULTS
 from catstream.wire.codec import VERSION, encode
+from catstream.wire.messages import End, Features, Health, ObjectFeatures, Position, TrainingRows
 from catstream.wire.monitor import Event, Monitor
 from catstream.wire.newest import Publisher, Subscriber
 from catstream.wire.rejects import rejected

@@ -1,1 +1,0 @@
-"""Measures the accuracy of trackers on annotated sequences, and writes reports."""

@@ -1,1 +1,0 @@
-"""Finds the objects of saved models in videos, folders and images."""

@@ -1,0 +1,1 @@
+"""Accuracy on sequences with ground truth, and load tests, with their reports."""

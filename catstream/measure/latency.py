@@ -1,0 +1,232 @@
+"""Observations of a stream under load, and their measures; and the use of processor and memory.
+
+Every due frame counts once, tracked or skipped. Its track latency ends with the first track of this frame or a newer
+one; its model latency ends with the first model whose training sample includes this frame or a newer one. Thus a
+pipeline does not get better figures by skipping frames while it is slow (no coordinated omission).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field, replace
+from threading import Event, Thread
+from time import monotonic
+
+import numpy as np
+import psutil
+
+from catstream.base.arrays import Float64
+from catstream.client.address import Address
+from catstream.client.attach import subscribe
+from catstream.errors import SilenceError
+from catstream.measure.camera import Schedule
+from catstream.measure.rtsp import due_time
+from catstream.measure.scores import overlaps
+from catstream.wire.messages import Model, Track
+
+#: The percentiles of latencies that are reported, by name.
+PERCENTILES = {"p50": 50.0, "p95": 95.0, "p99": 99.0, "p99.9": 99.9, "max": 100.0}
+
+#: Name of the load by other processes of this machine. If it is high, the figures of a load test are unreliable.
+REST = "everything else"
+
+_POLL_SECONDS = 0.1
+_SUCCESS = 0.5  # a frame with a larger IoU is a success
+
+
+@dataclass(slots=True)
+class Observations:
+    """The messages of one pipeline with their arrival times by `time.monotonic`, oldest first.
+
+    tracks  tracks of frames with a time stamp, in order of arrival, each with the due time of its frame as `pts`
+    models  due time of the newest training frame of each model; of a frame whose track has not arrived, there is none
+    first_motion_version  version of the first model with a motion model, 0 before it
+    """
+
+    tracks: list[tuple[float, Track]] = field(default_factory=list)
+    models: list[tuple[float, float]] = field(default_factory=list)
+    first_motion_version: int = 0
+    _due: dict[int, float] = field(default_factory=dict)  # of the newest frame with a number: a restart repeats some
+
+    @property
+    def warmed_up(self) -> bool:
+        """True if the start-up phase is over: the detector uses a model with a motion model."""
+        first = self.first_motion_version
+        return first > 0 and bool(self.tracks) and self.tracks[-1][1].model_version >= first
+
+    def add(self, moment: float, message: Track | Model) -> None:
+        match message:
+            case Track(pts=float(pts)):
+                due = self._due[message.frame] = due_time(pts, moment)
+                self.tracks.append((moment, replace(message, pts=due)))
+            case Model():
+                if message.frame in self._due:
+                    self.models.append((moment, self._due[message.frame]))
+                if message.motion is not None:
+                    self.first_motion_version = self.first_motion_version or message.version
+
+
+@contextmanager
+def observed(addresses: Sequence[Address], name: str) -> Iterator[list[Observations]]:
+    """Observe one object of each pipeline in threads, which end with the context or with their pipelines."""
+    streams, ended = [Observations() for _ in addresses], Event()
+
+    def observe(address: Address, channel: str, observations: Observations) -> None:
+        with subscribe(address, channel, object=name, timeout=_POLL_SECONDS) as messages:
+            while not ended.is_set():
+                try:
+                    message = next(messages)
+                except SilenceError:
+                    continue
+                except StopIteration:
+                    return
+                observations.add(monotonic(), message)
+
+    threads = [
+        Thread(target=observe, args=(address, channel, stream), name=f"observer of {channel}", daemon=True)
+        for address, stream in zip(addresses, streams, strict=True)
+        for channel in ("tracks", "models")
+    ]
+    for thread in threads:
+        thread.start()
+    try:
+        yield streams
+    finally:
+        ended.set()
+        for thread in threads:
+            thread.join()
+
+
+@dataclass(slots=True)
+class Measures:
+    """The measures of one stream.
+
+    due              due time of each frame, float64 (frames,)
+    tracked          whether each frame has a track, bool (frames,)
+    track            seconds from the due time of each frame to the track of this frame or a newer one; at most to the
+                     end of the run
+    model            seconds to the model trained on this frame or a newer one
+    success          share of the frames with a visible object for which the IoU of box and ground truth is above 0.5; a
+                     skipped frame has the box of the last tracked frame
+    totals           totals of the pipeline at its end; empty if the stream has not ended
+    """
+
+    due: Float64
+    tracked: np.ndarray
+    track: Float64
+    model: Float64
+    success: float
+    totals: dict[str, int] = field(default_factory=dict)
+
+    @property
+    def frames(self) -> int:
+        return len(self.due)
+
+    @property
+    def skipped(self) -> float:
+        """Share of frames without a track of their own."""
+        return 1 - float(self.tracked.mean())
+
+    @property
+    def figures(self) -> dict[str, float]:
+        """The figures that can have a limit, by name."""
+        model = {f"model-{name}": seconds for name, seconds in percentiles(self.model).items()}
+        return {**percentiles(self.track), **model, "skipped": self.skipped, "success": self.success}
+
+
+def measure(
+    observations: Observations, schedule: Schedule, frames: int, truth: Float64, end: float, totals: dict[str, int]
+) -> Measures:
+    """Compute the measures of one stream.
+
+    frames : number of due frames: all of the schedule of the camera, or those before an interruption
+    truth : boxes of the object in the images, which are sent over and over, float64 (images, 4), NaN if it is absent
+    end : time at which the observation ended
+    totals : totals of the pipeline at its end
+    """
+    due = np.array([schedule.due(number) for number in range(frames)])
+    tracks = [(moment, schedule.number(track.pts or 0.0)) for moment, track in observations.tracks]
+    tracked = np.isin(np.arange(frames), [number for _, number in tracks])
+    boxes = np.full((frames + 1, 4), np.nan)  # one more, without a box, for the frames before the first tracked one
+    for (_, number), (_, track) in zip(tracks, observations.tracks, strict=True):
+        if 0 <= number < frames:
+            boxes[number] = track.box or np.nan
+    last = np.maximum.accumulate(np.where(tracked, np.arange(frames), -1))
+    true = truth[np.arange(frames) % len(truth)]
+    is_success = overlaps(boxes[last], true)[np.isfinite(true).all(axis=1)] > _SUCCESS
+    models = [(moment, schedule.number(newest)) for moment, newest in observations.models]
+    return Measures(
+        due=due,
+        tracked=tracked,
+        track=latencies_to_answer(due, tracks, end),
+        model=latencies_to_answer(due, models, end),
+        success=float(is_success.mean()),
+        totals=totals,
+    )
+
+
+def percentiles(seconds: Float64) -> dict[str, float]:
+    """Return the `PERCENTILES` of at least one latency; each of them is the latency of a frame.
+
+    >>> percentiles(np.array([0.010] * 98 + [0.5, 2.0]))["p99"]
+    0.5
+    """
+    values = np.percentile(seconds, list(PERCENTILES.values()), method="inverted_cdf")
+    return dict(zip(PERCENTILES, values.tolist(), strict=True))
+
+
+def latencies_to_answer(due: Float64, answers: list[tuple[float, int]], end: float) -> Float64:
+    """Return the seconds from each frame's due time to the first answer for this or a newer frame, float64 (frames,).
+
+    due : due times, float64 (frames,)
+    answers : arrival time and frame number of each answer
+    end : arrival time that is assumed for frames without an answer
+
+    >>> latencies_to_answer(np.array([0.0, 1.0, 2.0, 3.0]), [(0.5, 0), (2.5, 2)], end=9.0)
+    array([0.5, 1.5, 0.5, 6. ])
+    """
+    first = np.full(len(due), np.inf)
+    for moment, number in answers:
+        if number >= 0:
+            place = min(number, len(due) - 1)
+            first[place] = min(first[place], moment)
+    first = np.minimum.accumulate(first[::-1])[::-1]
+    return np.asarray(np.minimum(first, end) - due)
+
+
+class Usage:
+    """Processor use of named groups of processes; after a restart, the process ids of a group may change.
+
+    readings  mean number of busy cores since the reading before, by name, and of `REST`, oldest first
+    """
+
+    def __init__(self) -> None:
+        self.readings: dict[str, list[float]] = {}
+        self._processes: dict[int, psutil.Process] = {}  # psutil keeps the processor time of the previous reading in it
+
+    def read(self, groups: Mapping[str, Iterable[int]]) -> None:
+        """Add a reading of groups of process ids; the first call only starts the measurement."""
+        is_first = not self._processes
+        all_cores = psutil.cpu_percent() / 100 * (psutil.cpu_count() or 1)
+        cores = {name: sum(map(self._cores, pids)) for name, pids in groups.items()}
+        if not is_first:
+            for name, reading in (cores | {REST: max(0.0, all_cores - sum(cores.values()))}).items():
+                self.readings.setdefault(name, []).append(reading)
+
+    def _cores(self, pid: int) -> float:
+        """Return the busy cores of a process; 0 if it has just ended."""
+        try:
+            self._processes[pid] = self._processes.get(pid) or psutil.Process(pid)
+            return float(self._processes[pid].cpu_percent() / 100)
+        except psutil.Error:
+            return 0.0
+
+
+def proportional_memory(pids: Iterable[int]) -> int:
+    """Return the bytes of these processes (PSS): a page that n processes share counts as 1/n of a page in each."""
+    total = 0
+    for pid in pids:
+        with suppress(psutil.Error):  # it has just ended
+            total += psutil.Process(pid).memory_full_info().pss
+    return total

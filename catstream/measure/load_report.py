@@ -1,0 +1,204 @@
+"""The results of a load test: tables of text, an HTML file, and JSON."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import fields
+from importlib.metadata import version
+from pathlib import Path
+from statistics import fmean
+from typing import NamedTuple
+
+from catstream.base.arrays import Float64
+from catstream.base.text import counted
+from catstream.measure.latency import PERCENTILES, percentiles
+from catstream.measure.load_result import Result, violations
+from catstream.measure.load_test import MOST_STREAMS, LoadTest
+from catstream.output.report import write_page
+
+_SUSTAINED = 0.01  # share of skipped frames up to which a rate counts as sustained
+
+
+class Table(NamedTuple):
+    """A table of text: its title, rows of cells by the heads of their columns, and an explanation of the columns."""
+
+    title: str
+    rows: list[dict[str, str]]
+    note: str = ""
+
+    @property
+    def heads(self) -> list[str]:
+        return list(self.rows[0])
+
+    @property
+    def cells(self) -> list[list[str]]:
+        return [[row.get(head, "") for head in self.heads] for row in self.rows]
+
+
+def tables(result: Result) -> Iterator[Table]:
+    """Yield the tables of a run: streams, processes and, if there were any, subscribers."""
+    streams = [
+        {
+            "stream": str(number),
+            "frames/s": f"{result.rate(stream.skipped):.1f}",
+            "skipped": f"{100 * stream.skipped:.1f} %",
+            **_cost(*result.cost(number)),
+            **_latencies(stream.track, stream.model),
+            "not stored": str(stream.totals["sent"] - stream.totals["stored"]) if stream.totals else "-",
+            "success": f"{stream.success:.3f}",
+        }
+        for number, stream in enumerate(result.streams)
+    ]
+    if len(streams) > 1:
+        streams.append({"stream": "all", **_latencies(result.track, result.model)})
+    yield Table(
+        "Streams",
+        streams,
+        "Cores: processor seconds per second of all processes of the stream; MB: their memory, in which a page that n "
+        "processes share counts as 1/n of a page (PSS). Latencies in milliseconds. Not stored: features "
+        "messages that were not in the coreset trees at the end. Success: share of frames with an IoU with the ground "
+        "truth above 0.5; a skipped frame has the box of the last tracked frame.",
+    )
+    if result.usage:
+        processes = [
+            {"process": name, **_cost(fmean(readings), result.memory.get(name))}
+            for name, readings in result.usage.items()
+        ]
+        yield Table("Processes", processes, "MB: as above (PSS), at the end of the run.")
+    if result.plan.subscribers:
+        subscribers = {
+            "of each stream": result.plan.subscribers,
+            "slow": result.plan.slow_subscribers,
+            "received, least": min(result.received, default=0),
+            "received, most": max(result.received, default=0),
+            "missed": sum(result.missed),
+            "missed, most": max(result.missed, default=0),
+        }
+        yield Table(
+            "Subscribers",
+            [{head: str(number) for head, number in subscribers.items()}],
+            "Frames whose tracks each of the fast subscribers received, and frames that they missed in total.",
+        )
+
+
+def milliseconds(seconds: float) -> str:
+    return f"{1000 * seconds:.3g}" if seconds < 1 else f"{1000 * seconds:.0f}"
+
+
+def _latencies(track: Float64, model: Float64) -> dict[str, str]:
+    of_model = {f"model {name}": percentiles(model)[name] for name in ("p50", "p99")}
+    return {name: milliseconds(seconds) for name, seconds in (percentiles(track) | of_model).items()}
+
+
+def _cost(cores: float, memory: float | None) -> dict[str, str]:
+    return {"cores": f"{cores:.2f}", "MB": "-" if memory is None else f"{memory / 1e6:.0f}"}
+
+
+def to_json(load_test: LoadTest) -> dict[str, object]:
+    """Return the figures of the decisive run and of the search steps, the version and the settings.
+
+    Units are seconds, bytes, and shares from 0 to 1.
+    """
+    result = load_test.result
+    plan = {item.name: getattr(result.plan, item.name) for item in fields(result.plan) if item.name != "settings"}
+    return {
+        "version": version("catstream"),
+        "settings": result.plan.settings.changed(),
+        "plan": plan,
+        "seconds": result.seconds,
+        "interrupted": load_test.interrupted,
+        "latency": {"track": percentiles(result.track), "model": percentiles(result.model)},
+        "streams": [
+            {
+                **dict(zip(("cores", "memory"), result.cost(number), strict=True)),
+                "frames": stream.frames,
+                "frames_per_second": result.rate(stream.skipped),
+                "skipped": stream.skipped,
+                "track": percentiles(stream.track),
+                "model": percentiles(stream.model),
+                **{name: stream.totals.get(name) for name in ("sent", "stored", "restarts")},
+                "success": stream.success,
+            }
+            for number, stream in enumerate(result.streams)
+        ],
+        "processes": {
+            name: {"cores": fmean(readings), "memory": result.memory.get(name)}
+            for name, readings in result.usage.items()
+        },
+        "subscribers": {"received": result.received, "missed": result.missed},
+        "camera_late": round(result.camera_late, 6),
+        "limits": {limit.name: {"value": limit.value, "met": limit.is_met(result)} for limit in load_test.limits},
+        "violations": load_test.violations,
+        "highest_streams": load_test.highest,
+        "steps": [
+            {
+                "streams": step.plan.streams,
+                **step.worst,
+                **dict(zip(("cores", "memory"), step.mean_cost, strict=True)),
+                "violations": violations(load_test.limits, step),
+            }
+            for step in load_test.results
+        ],
+        "refused": {str(streams): reason for streams, reason in load_test.refused.items()},
+    }
+
+
+def write_report(path: Path, load_test: LoadTest) -> Path:
+    """Write the report of the decisive run, and of the steps of a search."""
+    result = load_test.result
+    verdicts = [(f"{answer(load_test)}.", load_test.highest is not None) if load_test.find else _verdict(result)]
+    verdicts += [(error, False) for error in result.errors]
+    verdicts += [(limit.describe(result), limit.is_met(result)) for limit in load_test.limits]
+    return write_page(
+        path,
+        "loadtest.html",
+        verdicts=verdicts,
+        about=(
+            f"{result.plan}, {result.seconds:.1f} s{', interrupted' * load_test.interrupted}. Latency counts from the "
+            "due time of a frame, and ends for a skipped frame with the track of a newer one. The camera was at most "
+            f"{milliseconds(result.camera_late)} ms late, and other processes of this machine kept "
+            f"{result.other_load:.2f} cores busy."
+        ),
+        tables=[*([_steps(load_test)] if load_test.find else []), *tables(result)],
+        settings=result.plan.settings,
+    )
+
+
+def _verdict(result: Result) -> tuple[str, bool]:
+    """A sentence: every stream was tracked at its rate, or where and when most frames were skipped."""
+    number, worst = max(enumerate(result.streams), key=lambda stream: stream[1].skipped)
+    rate = f"{counted(len(result.streams), 'stream')} of {result.plan.rate:g} frames/s"
+    if worst.skipped <= _SUSTAINED:
+        return f"Sustained: {rate}, at most {100 * worst.skipped:.1f} % of the frames skipped.", True
+    since = worst.due[~worst.tracked][0] - worst.due[0]
+    return (
+        f"Not sustained: of {rate}, stream {number} skipped {100 * worst.skipped:.1f} % of its frames, the first after "
+        f"{since:.1f} s: it was tracked at {result.rate(worst.skipped):.1f} frames/s."
+    ), False
+
+
+def answer(load_test: LoadTest) -> str:
+    """How many streams this machine serves, and what a stream costs."""
+    if load_test.highest is None:
+        return "Interrupted: no answer yet" if load_test.interrupted else "No number of streams meets the limits"
+    (cores, memory), most = load_test.result.mean_cost, "at least " * (load_test.highest == MOST_STREAMS)
+    return (
+        f"This machine serves {most}{load_test.result.plan}; a stream takes {cores:.2f} cores and {memory / 1e6:.0f} MB"
+    )
+
+
+def _steps(load_test: LoadTest) -> Table:
+    rows = [
+        {
+            "streams": f"{step.plan.streams}",
+            "limits": "exceeded" if violations(load_test.limits, step) else "met",
+            "tracked": f"{step.rate(step.worst['skipped']):.1f}",
+            "skipped": f"{100 * step.worst['skipped']:.1f} %",
+            **{f"{name} ms": milliseconds(step.worst[name]) for name in PERCENTILES},
+            **_cost(*step.mean_cost),
+        }
+        for step in load_test.results
+    ]
+    refused = "".join(f" {streams} streams did not start: {reason}." for streams, reason in load_test.refused.items())
+    note = f"The runs, in this order, with the figures of the worst stream; cores and MB are means.{refused}"
+    return Table("Steps of the search", rows, note)

@@ -1,0 +1,195 @@
+"""The plan of a run of a load test, its results, and the limits that they have to meet."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from statistics import fmean
+
+import numpy as np
+
+from catstream.base.arrays import Float64
+from catstream.base.names import check_count
+from catstream.base.settings import Settings
+from catstream.base.text import counted
+from catstream.errors import SettingsError
+from catstream.measure.latency import PERCENTILES, REST, Measures
+from catstream.video import rendered
+
+#: The figures that can have a limit, by name. If there are several streams, the worst one counts.
+KINDS = {
+    **dict.fromkeys(PERCENTILES, "from a frame to its track"),
+    **{f"model-{name}": "from a frame to the model trained on it" for name in PERCENTILES},
+    "skipped": "share of frames that were not tracked",
+    "missed": "share of frames whose tracks fast subscribers missed",
+    "success": "share of frames with an IoU above 0.5",
+}
+_SHARES = ("skipped", "missed", "success")  # the other figures are times
+
+#: Is called about ten times a second with the current activity, the share of it that is done, and current figures.
+Report = Callable[[str, float, str], None]
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """The parameters of one run.
+
+    streams           number of pipelines, each of three processes
+    objects           number of objects that each pipeline tracks
+    subscribers       number of subscribers to the tracks of each stream
+    slow_subscribers  number of slow ones among them
+    rate              frames per second of each stream, whether or not the pipeline keeps up
+    duration          seconds
+    size              (width, height) of a frame in pixels
+    source            "mjpeg" (over HTTP) or "h264" (over RTSP)
+    settings          settings of all pipelines
+    """
+
+    streams: int = 1
+    objects: int = 1
+    subscribers: int = 0
+    slow_subscribers: int = 0
+    rate: float = 25.0
+    duration: float = 10.0
+    size: tuple[int, int] = rendered.SIZE
+    source: str = "mjpeg"
+    settings: Settings = field(default_factory=Settings)
+
+    def __post_init__(self) -> None:
+        if self.slow_subscribers > self.subscribers:
+            raise SettingsError(
+                f"more slow subscribers ({self.slow_subscribers}) than subscribers ({self.subscribers}): "
+                "raise --subscribers, or lower --slow-subscribers"
+            )
+        if self.frames < 1:
+            raise SettingsError(
+                f"no frame is due in {self.duration:g} s at {self.rate:g} frames/s: raise --rate or --duration"
+            )
+        if self.source == "h264" and any(side % 2 for side in self.size):
+            raise SettingsError(
+                f"H.264 needs an even width and height, got {self.size[0]}x{self.size[1]}: pass another --size"
+            )
+        check_count(self.objects, self.settings.run.max_objects)
+        if self.settings.run.lockstep:
+            raise SettingsError(
+                "a load test does not support lockstep, because its frames do not wait for models: omit run.lockstep"
+            )
+
+    def __str__(self) -> str:
+        objects = f", {self.objects} objects" if self.objects > 1 else ""
+        video = f"{self.size[0]}x{self.size[1]} pixels ({self.source})"
+        return f"{counted(self.streams, 'stream')} of {video}{objects}, {self.rate:g} frames/s due in each"
+
+    @property
+    def frames(self) -> int:
+        return round(self.rate * self.duration)
+
+
+@dataclass(slots=True)
+class Result:
+    """The results of one run.
+
+    plan         parameters of the run
+    seconds      duration of the measured frames: less than planned if the run was interrupted
+    streams      measures of each stream
+    usage        readings of the busy cores of each process, and of the processes outside the load test
+    received     number of frames whose tracks each fast subscriber received; `missed` is the number that it missed
+    camera_late  largest delay in seconds of a frame that the camera itself caused
+    memory       bytes of each process, in which a shared page counts in proportion (PSS)
+    errors       errors of failed streams
+    interrupted  whether the run was interrupted
+    """
+
+    plan: Plan
+    seconds: float
+    streams: list[Measures]
+    usage: dict[str, list[float]]
+    received: list[int]
+    missed: list[int]
+    camera_late: float
+    memory: dict[str, int] = field(default_factory=dict)
+    errors: list[str] = field(default_factory=list)
+    interrupted: bool = False
+
+    @property
+    def worst(self) -> dict[str, float]:
+        """The value of each of the `KINDS`."""
+        streams = [stream.figures for stream in self.streams]
+        worst = {name: (min if name == "success" else max)(stream[name] for stream in streams) for name in streams[0]}
+        return worst | {"missed": sum(self.missed) / max(1, sum(self.missed) + sum(self.received))}
+
+    @property
+    def track(self) -> Float64:
+        """The latencies of the frames of all streams."""
+        return np.concatenate([stream.track for stream in self.streams])
+
+    @property
+    def model(self) -> Float64:
+        return np.concatenate([stream.model for stream in self.streams])
+
+    def rate(self, skipped: float) -> float:
+        """Return the tracked frames per second if this share was skipped."""
+        return self.plan.rate * (1 - skipped)
+
+    def cost(self, number: int) -> tuple[float, int]:
+        """Return the processor seconds per second, and the bytes of memory, of the processes of a stream."""
+        of_stream = f" {number}"
+        cores = sum(fmean(readings) for name, readings in self.usage.items() if name.endswith(of_stream))
+        return cores, sum(size for name, size in self.memory.items() if name.endswith(of_stream))
+
+    @property
+    def mean_cost(self) -> tuple[float, float]:
+        cores, sizes = zip(*map(self.cost, range(len(self.streams))), strict=True)
+        return fmean(cores), fmean(sizes)
+
+    @property
+    def other_load(self) -> float:
+        """Mean number of cores that were busy with processes outside the load test."""
+        return fmean(self.usage[REST]) if REST in self.usage else 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Limit:
+    """A limit on one of the `KINDS`: a minimum of the success, a maximum of the others.
+
+    >>> Limit.parse("p99=0.1")
+    Limit(name='p99', value=0.1)
+    """
+
+    name: str
+    value: float
+
+    @classmethod
+    def parse(cls, text: str) -> Limit:
+        """Read `NAME=VALUE`; times are in seconds."""
+        name, _, number = text.partition("=")
+        try:
+            value = float(number)
+        except ValueError:
+            value = float("nan")
+        if name not in KINDS or not 0 <= value < float("inf"):
+            raise SettingsError(
+                f"a limit is NAME=VALUE with one of {', '.join(KINDS)}, got {text!r}: for example p99=0.1"
+            )
+        return cls(name, value)
+
+    def __str__(self) -> str:
+        return f"{self.name}={self.value:g}"
+
+    def is_met(self, result: Result) -> bool:
+        value = result.worst[self.name]
+        return value >= self.value if self.name == "success" else value <= self.value
+
+    def describe(self, result: Result) -> str:
+        """The figure and its limit, times in milliseconds, as in the tables."""
+        value, limit = (
+            f"{number:.4g}" if self.name in _SHARES else f"{1000 * number:.4g} ms"
+            for number in (result.worst[self.name], self.value)
+        )
+        sense = "least" if self.name == "success" else "most"
+        return f"{self.name} is {value}, limit at {sense} {limit} ({KINDS[self.name]})"
+
+
+def violations(limits: Iterable[Limit], result: Result) -> list[str]:
+    """Return a line for each stream that failed and each limit that was not met."""
+    return [*result.errors, *(limit.describe(result) for limit in limits if not limit.is_met(result))]

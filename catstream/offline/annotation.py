@@ -1,0 +1,444 @@
+"""`catstream.annotate`: tracks between boxes that a person has drawn at keyframes of a video."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import Future
+from contextlib import closing
+from dataclasses import dataclass, field
+from itertools import pairwise
+from pathlib import Path
+from typing import NamedTuple, Self, cast
+
+import numpy as np
+
+from catstream.base.addresses import is_live, without_password
+from catstream.base.arrays import Float64
+from catstream.base.box import Box
+from catstream.base.names import UNNAMED, check_count, check_name, errors_about
+from catstream.base.settings import Settings
+from catstream.base.text import listed
+from catstream.base.threads import cores
+from catstream.base.workers import Workers
+from catstream.errors import BoxError, ObjectError, VideoError
+from catstream.offline.fusion import fuse
+from catstream.offline.keyframes import HIDDEN, KeyframeBox, parse_box
+from catstream.offline.object_tracks import CHECKED, ObjectTracks
+from catstream.offline.passes import Pass, box_of, row_of, run_pass
+from catstream.video.source import ALL_FRAMES
+from catstream.video.video_frames import VideoFrames
+from catstream.wire.messages import Check
+
+#: Called during the work with its name, the number of finished frames, and of all; None if that is unknown.
+Progress = Callable[[str, int, int | None], object]
+
+#: The boxes of objects by frame, None where the object is absent, "hidden" where too much of it is covered to draw a
+#: box: of one object without a name, or by name.
+_BoxesByFrame = Mapping[int, str | Iterable[float] | None]
+KeyframeBoxes = _BoxesByFrame | Mapping[str, _BoxesByFrame]
+
+
+class NextFrame(NamedTuple):
+    """The frame to annotate next, and the object.
+
+    errors  expected number of wrong frames in the stretch that the frame divides
+    """
+
+    frame: int
+    object: str
+    errors: float
+
+
+@dataclass(frozen=True, slots=True)
+class Task:
+    """A pass to be tracked, and the boxes that it begins with: that at `start`; with a memory, all of the object."""
+
+    object: str = field(compare=False)  # the pass depends on the boxes only
+    start: int
+    stop: int
+    keyframes: tuple[tuple[int, Box | None], ...]
+    use_memory: bool
+
+    @property
+    def frames(self) -> int:
+        return abs(self.start - self.stop)
+
+
+class _Stretch(NamedTuple):
+    """The frames of an object between two keyframes, or between a keyframe and an end of the video."""
+
+    object: str
+    start: int
+    stop: int  # the frame after the last one
+
+
+class Annotation:
+    """The keyframes of the objects of a video, and the tracks between them.
+
+    Call `track` after the constructor, which only opens the video; `annotate` does both. Each stretch between two
+    keyframes is tracked from both ends. If that does not check all of its frames, it is tracked from both ends again,
+    with the merged model of all other boxes of the object. `add` tracks only beside its box; earlier passes are still
+    used as far as they agree with the boxes. No pass begins or ends in a frame where the object is hidden. Close the
+    annotation, or use it in a `with`: until then, its processes run. Frames are decoded from the video when needed.
+
+    Parameters
+    ----------
+    video : path of a file or a folder of images
+    boxes : mapping of frame to box, or of object to such a mapping
+        Frames count from 0; a box is None where the object is absent, "hidden" where it is covered.
+    settings : Settings or mapping of str
+        The settings that differ from the defaults.
+    part : slice of the frames of the video, whose frames count from 0; by default all
+    jobs : number of processes; None for the number of cores
+    progress : function that is called during the work, see `Progress`
+
+    Attributes
+    ----------
+    frames : VideoFrames
+    keyframes : dict of the boxes of each object, by name and frame
+    counters : counters of the video by name, see `catstream.video.frames.describe_counters`
+    progress : as of the parameters
+
+    Raises
+    ------
+    VideoError
+        If the video is live or cannot be read; from `track` also if a frame cannot be decoded.
+    BoxError
+        For a box outside its frame; from `scan` and `track` also for a frame beyond the end of the video.
+    ObjectError
+        For a name that is not valid, an object without a box, or too many.
+    """
+
+    def __init__(
+        self,
+        video: str | os.PathLike[str],
+        boxes: KeyframeBoxes,
+        settings: Settings | Mapping[str, object] | None = None,
+        *,
+        part: slice = ALL_FRAMES,
+        jobs: int | None = None,
+        progress: Progress = lambda *_: None,
+    ) -> None:
+        self.settings = Settings().replace(settings)
+        self._jobs, self.progress = jobs or cores(), progress
+        if is_live(os.fspath(video)):
+            redacted = without_password(os.fspath(video))
+            raise VideoError(f"cannot annotate a live source ({redacted}): record it to a file first")
+        self._passes: dict[Task, Pass | None] = {}  # None if it cannot start
+        self._fusions: dict[_Stretch, tuple[Float64, Float64, Float64]] = {}  # what is known of them, fused
+        self._workers = Workers(self._jobs)
+        self._folder = tempfile.TemporaryDirectory(prefix="catstream-annotate-", ignore_cleanup_errors=True)
+        try:
+            self.frames = VideoFrames(os.fspath(video), part, self.settings.run)
+            self._is_scanned = False
+            self.set_boxes(boxes)
+        except BaseException:
+            self._folder.cleanup()
+            raise
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def __repr__(self) -> str:
+        count = sum(map(len, self.keyframes.values()))
+        return f"<catstream.Annotation of {self.frames.name}: {count} boxes, {self.share_checked:.0%} checked>"
+
+    def stop(self) -> None:
+        """End the processes and close the video, until a method needs them again."""
+        self._workers.kill()
+        self.frames.close()
+
+    def close(self) -> None:
+        """End the processes and close the video; `add` and `track` cannot be called any more."""
+        self.stop()
+        self._folder.cleanup()
+
+    def add(self, frame: int, box: str | Iterable[float] | None, object: str = UNNAMED) -> None:
+        """Add or replace the box of an object at a frame, and track what depends on it; None or "hidden" as of `boxes`.
+
+        BoxError or ObjectError as of the constructor.
+        """
+        name = check_name(object)
+        drawn: _BoxesByFrame = {**self.keyframes.get(name, {}), frame: box}
+        self.set_boxes({**self.keyframes, name: drawn})
+        self.track()
+
+    def set_boxes(self, boxes: KeyframeBoxes) -> None:
+        """Replace the boxes of all objects, without tracking. BoxError or ObjectError as of the constructor."""
+        parsed = _parsed(boxes)
+        check_count(len(parsed), self.settings.run.max_objects)
+        self._check(parsed)
+        for stretch in [*self._fusions]:
+            if parsed.get(stretch.object) != self.keyframes[stretch.object]:
+                del self._fusions[stretch]
+        self.keyframes: dict[str, dict[int, KeyframeBox]] = parsed
+        self._drawn = {
+            name: {frame: box for frame, box in boxes.items() if box != HIDDEN} for name, boxes in parsed.items()
+        }
+
+    @property
+    def counters(self) -> dict[str, float]:
+        return self.frames.counters
+
+    def scan(self, *, exact: bool = False) -> None:
+        """Number the frames, if they are not yet; `exact` as of `VideoFrames.scan`.
+
+        VideoError if a frame cannot be decoded: those before it are numbered, and `track` uses them.
+        """
+        if exact or not self._is_scanned:
+            self._is_scanned = True
+            self._passes.clear()
+            self._fusions.clear()
+            self.progress("reading", len(self.frames), None)
+            try:
+                self.frames.scan(lambda *done: self.progress("reading", *done), exact=exact)
+            except BaseException as error:
+                self._is_scanned = isinstance(error, VideoError)  # if not, it was interrupted by `progress`
+                raise
+        self._check(self.keyframes)
+
+    def track(self) -> None:
+        """Run the passes that are missing. If it is interrupted, the finished passes remain."""
+        self.scan()
+        while tasks := self.missing():
+            total, finished = sum(task.frames for task in tasks), 0
+            work = [(task, self.frames, self.settings, Path(self._folder.name)) for task in tasks]
+            results = self._workers.run(_work, work) if self._jobs > 1 else (_work(*task) for task in work)
+            try:
+                with closing(results):
+                    for task, one in results:
+                        self._insert(task, one)
+                        finished += task.frames
+                        self.progress("tracking again" if task.use_memory else "tracking", finished, total)
+            except VideoError:
+                if self.frames.is_exact:
+                    raise
+                self.scan(exact=True)
+
+    def missing(self) -> list[Task]:
+        """The passes that are missing, longest first: of each stretch those without a memory, then those with one.
+
+        A pass without a memory is not missing if a longer one starts at the same keyframe: it has the same boxes. Those
+        with a memory are missing if the frames are not checked, and there are other boxes of the object.
+        """
+        tasks: list[Task] = []
+        for stretch in self._stretches():
+            plain = self._missing_of(stretch, use_memory=False)
+            several = len(self._drawn[stretch.object]) > 1
+            again = several and not plain and not self._is_checked(stretch)
+            tasks += self._missing_of(stretch, use_memory=True) if again else plain
+        return sorted(tasks, key=lambda task: -task.frames)
+
+    def submit(self, task: Task) -> tuple[Future[tuple[Task, Pass | None]], Path]:
+        """Run a missing pass in one of the processes; `store` takes it.
+
+        The size of the file is the number of frames that are tracked. If the file is deleted, the pass is stopped.
+        """
+        file, count = tempfile.mkstemp(dir=self._folder.name)
+        os.close(file)
+        work = task, self.frames, self.settings, Path(self._folder.name), Path(count)
+        return self._workers.submit(_work, *work), Path(count)
+
+    def store(self, future: Future[tuple[Task, Pass | None]]) -> None:
+        """Store a pass that was submitted; it is used as long as the boxes that it began with are there.
+
+        VideoError if a frame could not be decoded.
+        """
+        self._insert(*self._workers.result(future))
+
+    @property
+    def tracks(self) -> dict[str, ObjectTracks]:
+        """The track of each object in all frames, by name, with `checked` and `probability`; doubtful if unchecked."""
+        return {name: self._tracks(name) for name in self.keyframes}
+
+    @property
+    def checked(self) -> dict[str, list[Check]]:
+        """The check of each frame (keyframe, hidden, checked or unchecked), by the name of the object."""
+        return {name: [*map(tracks.check, range(len(tracks)))] for name, tracks in self.tracks.items()}
+
+    @property
+    def share_checked(self) -> float:
+        """Share of frames that are not unchecked, over all objects, from 0 to 1."""
+        unchecked = [tracks.unchecked for tracks in self.tracks.values()]
+        return 1 - float(np.mean(unchecked)) if unchecked else 0.0
+
+    def passes(self, name: str = UNNAMED) -> list[Pass]:
+        """The finished passes of an object, in the order of their keyframes: the proposals for its unchecked frames."""
+        drawn = self._drawn.get(name, {}).items()
+        passes = [one for task, one in self._passes.items() if one is not None and set(task.keyframes) <= drawn]
+        return sorted(passes, key=lambda one: (one.start, one.stop, one.with_memory))
+
+    def proposals(self, name: str, frame: int) -> dict[bool, Box | None]:
+        """The box of the best pass at a frame that is not a keyframe, for each direction: True is forwards.
+
+        The best one has the highest score there. A direction without a pass is left out.
+        """
+        boxes: dict[bool, Box | None] = {}
+        for stretch in self._stretches():
+            if stretch.object == name and stretch.start <= frame < stretch.stop:
+                candidates = [(part, abs(frame - part.start) - 1) for part in self._parts(stretch)]
+                for part, place in sorted(candidates, key=lambda one: one[0].scores[one[1]]):  # the best one last
+                    boxes[part.is_forward] = box_of(part.boxes[place])
+        return boxes
+
+    def next_frame(self) -> NextFrame | None:
+        """The first of `next_frames`; None if all frames are checked."""
+        return next(iter(self.next_frames()), None)
+
+    def next_frames(self) -> list[NextFrame]:
+        """A frame to annotate in each stretch that is not checked, in the order of their expected errors.
+
+        It divides the expected errors of its stretch into halves, or those on the side of the hidden frames where most
+        are; at an end of the video without a keyframe, it is the first or the last frame.
+        """
+        unchecked = (stretch for stretch in self._stretches() if not self._is_checked(stretch))
+        return sorted(map(self._next_in, unchecked), key=lambda frame: -frame.errors)
+
+    def _check(self, keyframes: Mapping[str, Mapping[int, KeyframeBox]]) -> None:
+        """Raise BoxError if a box is not in its frame, or a keyframe not in the video, as soon as that is known."""
+        for name, drawn in keyframes.items():
+            for frame, box in drawn.items():
+                with errors_about(name):
+                    if self._is_scanned and not 0 <= frame < len(self.frames):
+                        raise BoxError(
+                            f"frame {frame} is outside the video: pass a frame from 0 to {len(self.frames) - 1}"
+                        )
+                    if isinstance(box, Box):
+                        box.validated(*self.frames.size)
+
+    def _stretches(self) -> Iterator[_Stretch]:
+        """Yield the stretches of all objects that have a frame."""
+        for name, drawn in self._drawn.items():
+            ends = [-1, *sorted(drawn), len(self.frames)]
+            for before, after in pairwise(ends):
+                if after - before > 1:
+                    yield _Stretch(name, before + 1, after)
+
+    def _ways(self, stretch: _Stretch) -> list[tuple[int, int]]:
+        """Start and stop of the passes of a stretch: one from each of its ends that is a keyframe."""
+        drawn, before, after = self._drawn[stretch.object], stretch.start - 1, stretch.stop
+        ways = [(before, min(after, len(self.frames) - 1)), (after, max(before, 0))]
+        return [way for way in ways if way[0] in drawn]
+
+    def _missing_of(self, stretch: _Stretch, *, use_memory: bool) -> list[Task]:
+        name, drawn = stretch.object, self._drawn[stretch.object]
+        tasks = []
+        for start, stop in self._ways(stretch):
+            boxes = tuple(sorted(drawn.items())) if use_memory else ((start, drawn[start]),)
+            task = Task(name, start, stop, boxes, use_memory)
+            same = (one for one in self.passes(name) if one.start == start and one.with_memory == use_memory)
+            done = any(one.stop == stop or (one.covers(start, stop) and not use_memory) for one in same)
+            if not done and task not in self._passes and (use_memory or drawn[start] is not None):
+                tasks.append(task)
+        return tasks
+
+    def _tracks(self, name: str) -> ObjectTracks:
+        drawn, count = self._drawn[name], len(self.frames)
+        boxes, probabilities, scores = np.full((count, 4), np.nan), np.ones(count), np.ones(count)
+        for frame, box in drawn.items():
+            boxes[frame] = row_of(box)
+        for stretch in self._stretches():
+            if stretch.object == name:
+                part = slice(stretch.start, stretch.stop)
+                boxes[part], probabilities[part], scores[part] = self._fused(stretch)
+        return ObjectTracks(name, self.keyframes[name], self.frames.times, boxes, probabilities, scores)
+
+    def _parts(self, stretch: _Stretch) -> list[Pass]:
+        """The parts of the finished passes that run over a stretch."""
+        drawn = self._drawn[stretch.object]
+        parts = (one.part(*way, drawn) for way in self._ways(stretch) for one in self.passes(stretch.object))
+        return [part for part in parts if part is not None]
+
+    def _fused(self, stretch: _Stretch) -> tuple[Float64, Float64, Float64]:
+        if stretch not in self._fusions:
+            fused = fuse(self._parts(stretch), stretch.start, stretch.stop, self._drawn[stretch.object])
+            self._fusions[stretch] = fused
+        return self._fusions[stretch]
+
+    def _insert(self, task: Task, one: Pass | None) -> None:
+        self._passes[task] = one
+        first, last = sorted((task.start, task.stop))
+        for stretch in [*self._fusions]:
+            if stretch.start <= last and first < stretch.stop:
+                del self._fusions[stretch]
+
+    def _hidden(self, stretch: _Stretch) -> list[int]:
+        """The frames of a stretch in which the object is hidden, counted from its start."""
+        hidden = self.keyframes[stretch.object].keys() - self._drawn[stretch.object].keys()
+        return sorted(frame - stretch.start for frame in hidden if stretch.start <= frame < stretch.stop)
+
+    def _is_checked(self, stretch: _Stretch) -> bool:
+        unchecked = self._fused(stretch)[1] < CHECKED
+        unchecked[self._hidden(stretch)] = False
+        return not unchecked.any()
+
+    def _next_in(self, stretch: _Stretch) -> NextFrame:
+        errors, hidden = 1 - self._fused(stretch)[1], self._hidden(stretch)
+        errors[hidden] = 0.0
+        answers, last = self.keyframes[stretch.object], len(self.frames) - 1
+        if stretch.start == 0 and 0 not in answers:
+            frame = 0
+        elif stretch.stop == last + 1 and last not in answers:
+            frame = last
+        else:
+            parts = np.split(np.arange(len(errors)), hidden)
+            part = max(parts, key=lambda part: errors[part].sum())
+            middle = np.searchsorted(errors[part].cumsum(), errors[part].sum() / 2)
+            frame = stretch.start + int(part[middle])
+        return NextFrame(frame, stretch.object, float(errors.sum()))
+
+
+def annotate(
+    video: str | os.PathLike[str],
+    boxes: KeyframeBoxes,
+    settings: Settings | Mapping[str, object] | None = None,
+    *,
+    part: slice = ALL_FRAMES,
+    jobs: int | None = None,
+    progress: Progress = lambda *_: None,
+) -> Annotation:
+    """Track objects between boxes at keyframes of a video, and check the tracks.
+
+    Each stretch between two boxes is tracked from both ends. A frame is checked if the passes agree so well that its
+    box is right with a probability of 97 %, see `catstream.offline.fusion`. See `Annotation` for the parameters
+    and errors.
+    """
+    if not boxes:
+        raise ObjectError("no object: pass the box of one in at least one frame")
+    annotation = Annotation(video, boxes, settings, part=part, jobs=jobs, progress=progress)
+    try:
+        annotation.track()
+    except BaseException:
+        annotation.close()
+        raise
+    return annotation
+
+
+def _work(
+    task: Task, frames: VideoFrames, settings: Settings, models: Path, count: Path | None = None
+) -> tuple[Task, Pass | None]:
+    way = task.start, task.stop, dict(task.keyframes)
+    try:
+        return task, run_pass(frames, *way, settings, models, use_memory=task.use_memory, count=count)
+    finally:
+        frames.close()
+
+
+def _parsed(boxes: KeyframeBoxes) -> dict[str, dict[int, KeyframeBox]]:
+    """The boxes by object and frame; ObjectError if an object has no box, or a name is not valid."""
+    if all(isinstance(value, Mapping) for value in boxes.values()):
+        by_name = cast(Mapping[str, _BoxesByFrame], boxes)
+    else:
+        by_name = {UNNAMED: cast(_BoxesByFrame, boxes)}
+    parsed: dict[str, dict[int, KeyframeBox]] = {}
+    for name, drawn in by_name.items():
+        with errors_about(check_name(name)):
+            parsed[name] = {int(frame): box if box is None else parse_box(box) for frame, box in drawn.items()}
+        if not any(isinstance(box, Box) for box in parsed[name].values()):
+            raise ObjectError(f"{listed([name])} has no box: pass its box in at least one frame")
+    return parsed

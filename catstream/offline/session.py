@@ -1,0 +1,322 @@
+"""An annotation that a person changes while its passes run: what the page of `catstream annotate` shows."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future
+from pathlib import Path
+from typing import Any, Self
+
+from catstream.base.arrays import UInt8
+from catstream.base.box import Box
+from catstream.base.workers import release_memory
+from catstream.errors import CatstreamError, CommandRejectedError, ObjectError, VideoError
+from catstream.offline.annotation import Annotation, NextFrame, Task
+from catstream.offline.keyframes import KeyframeBox
+from catstream.offline.object_tracks import ObjectTracks
+
+#: Passes of more frames have processes of their own, so that a correction of a short stretch does not wait for them.
+_LONG = 600
+
+#: Expected errors of a stretch from which a box is asked for while others are tracked.
+_WORTHWHILE = 3.0
+
+
+class _StoppedError(Exception):
+    pass
+
+
+class Session:
+    """Changes the boxes of an annotation, while a thread reads the video and runs the missing passes.
+
+    Objects take turns, beginning with the object of the newest box; the passes of the newest box of each run first. The
+    methods may be called from any thread. Use it in a `with`, also more than once: it goes on where it was. The owner
+    of the annotation closes it afterwards.
+
+    Parameters
+    ----------
+    annotation : Annotation whose frames are not numbered yet
+    jobs : number of passes that run at a time, and as many long ones beside them
+    save : function that is called after each change of the keyframes
+    write : function that writes the results; called by `finish`
+
+    Attributes
+    ----------
+    revision : number of changes of the keyframes and of what follows
+    decoded : whether the frames of the video are numbered
+    tracks : the newest tracks of the objects, by name
+    next_frames : frames to look at next, but those in stretches that are tracked at present
+    problem : error that ended reading or tracking; None if there is none
+    finished : event that `finish` sets
+    lock : held while the annotation changes
+    """
+
+    def __init__(
+        self, annotation: Annotation, jobs: int, save: Callable[[], object], write: Callable[[], object]
+    ) -> None:
+        self.annotation, self._jobs, self._save, self.write = annotation, jobs, save, write
+        self.revision, self.decoded = 0, False
+        self.tracks: dict[str, ObjectTracks] = {}
+        self.next_frames: list[NextFrame] = []
+        self.problem: CatstreamError | None = None
+        self.finished, self.lock = threading.Event(), threading.Condition(threading.RLock())
+        self._history: list[tuple[str, int | None, dict[str, dict[int, KeyframeBox]]]] = []  # with the boxes before
+        self._newest: dict[str, int] = {}  # frame of the newest box of each object
+        self._turns: dict[str, int] = {}  # number of the newest pass of each object, without one its turn is next
+        self._missing: list[Task] = []
+        self._running: dict[Future[Any], tuple[Task, Path]] = {}  # with the file that counts its frames
+        self._wakes, self._closed, self._is_damaged = True, False, False
+        annotation.progress = self._check_closed
+        annotation.frames.is_threaded = True  # for the pictures of the page
+
+    def __enter__(self) -> Self:
+        self._thread = threading.Thread(target=self._run, name="session", daemon=True)
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._closed = True
+        self._wake()
+        self._thread.join()
+        self.annotation.stop()
+        self._running.clear()
+        self._closed, self._wakes = False, True
+
+    @property
+    def can_undo(self) -> bool:
+        return bool(self._history)
+
+    def draw(self, object: str, frame: int, box: KeyframeBox) -> None:
+        """Add or replace the box of an object at a frame; errors as of `Annotation`."""
+        with self.lock:
+            before = self.annotation.keyframes
+            self._newest[object] = frame
+            self._turns.pop(object, None)
+            self._replace({**before, object: {**before.get(object, {}), frame: box}})
+            self._history.append((object, frame, before))
+
+    def delete(self, object: str, frame: int | None = None) -> None:
+        """Delete the box of an object at a frame; without a frame, or with its last box, delete the object."""
+        with self.lock:
+            before = self.annotation.keyframes
+            boxes = {number: box for number, box in before.get(object, {}).items() if frame not in (None, number)}
+            after = {name: boxes if name == object else drawn for name, drawn in before.items()}
+            if not any(isinstance(box, Box) for box in boxes.values()):
+                after.pop(object, None)
+            if after != before:
+                self._replace(after)
+                self._history.append((object, frame, before))
+
+    def rename(self, object: str, name: str) -> None:
+        """Rename an object, which keeps its passes; ObjectError if there is another object with this name."""
+        with self.lock:
+            before = self.annotation.keyframes
+            if name == object:
+                return
+            if name in before:
+                raise ObjectError(f"there is an object {name} already: use another name")
+            self._replace({name if other == object else other: drawn for other, drawn in before.items()})
+            self._history.append((object, None, before))
+
+    def undo(self) -> tuple[str, int | None] | None:
+        """Undo the last change; return its object, and the frame of its box. None if there is none."""
+        with self.lock:
+            if not self._history:
+                return None
+            object, frame, before = self._history.pop()
+            self._replace(before)
+            return object, frame
+
+    def image(self, number: int) -> UInt8:
+        """Return the image of a frame. VideoError if it cannot be decoded: the damage is then looked for."""
+        try:
+            return self.annotation.frames[number]
+        except VideoError:
+            with self.lock:
+                self._is_damaged = not self.annotation.frames.is_exact
+                self._wake()
+            raise
+
+    def finish(self) -> None:
+        """Write the results so far, and set `finished`. VideoError if they cannot be written."""
+        with self.lock:
+            if not self.decoded:
+                raise VideoError("the video is not read yet: wait, or press Ctrl-C where the command runs")
+            self.write()
+            self.finished.set()
+
+    def remaining(self) -> int:
+        """Number of frames that passes have to track, in both directions."""
+        with self.lock:
+            tracked = {task: count.stat().st_size for task, count in self._running.values()}
+            return sum(max(1, task.frames - tracked.get(task, 0)) for task in self._missing)
+
+    def _replace(self, keyframes: dict[str, dict[int, KeyframeBox]]) -> None:
+        if self.finished.is_set():
+            raise CommandRejectedError("the results are written: run the same command to continue")
+        before = self.annotation.keyframes
+        self.annotation.set_boxes(keyframes)
+        try:
+            self._save()
+        except BaseException:
+            self.annotation.set_boxes(before)
+            raise
+        self._wake()
+
+    def _wake(self) -> None:
+        with self.lock:
+            self.revision += 1
+            self._wakes = True
+            self.lock.notify()
+
+    def _check_closed(self, *_: object) -> None:
+        if self._closed:
+            raise _StoppedError
+
+    def _run(self) -> None:
+        try:
+            self._scan()
+            while True:
+                with self.lock:
+                    self.lock.wait_for(lambda: self._wakes or self._closed)
+                    if self._closed:
+                        return
+                    self._wakes = False
+                    if not self._is_damaged:
+                        self._schedule()
+                if self._is_damaged:
+                    self._scan(exact=True)
+        except CatstreamError as error:
+            self.problem = error
+        except _StoppedError:  # while it reads
+            pass
+
+    def _scan(self, *, exact: bool = False) -> None:
+        """Number the frames: before the first damaged one, they can be annotated."""
+        self.decoded = self._is_damaged = False
+        for running in [*self._running]:
+            self._stop(running)
+        try:
+            self.annotation.scan(exact=exact)
+        except VideoError as error:
+            self.problem = error
+        self.annotation.scan()
+        release_memory()
+        self.decoded = True
+        self._wake()
+
+    def _schedule(self) -> None:
+        """Store the passes that ended, stop those that are not missing any more, and start others."""
+        for future in [future for future in self._running if future.done()]:
+            del self._running[future]
+            try:
+                self.annotation.store(future)
+            except VideoError:
+                if self.annotation.frames.is_exact:
+                    raise
+                self._is_damaged = True
+                return
+        self._missing = self.annotation.missing()
+        for future, (task, _) in [*self._running.items()]:
+            if task not in self._missing:
+                self._stop(future)
+        while following := self._next_task():
+            self._turns[following.object] = max(self._turns.values(), default=0) + 1
+            future, count = self.annotation.submit(following)
+            self._running[future] = following, count
+            future.add_done_callback(lambda _: self._wake())
+        self.tracks = self.annotation.tracks
+        least = _WORTHWHILE if self._missing else 0.0
+        frames = (frame for frame in self.annotation.next_frames() if frame.errors >= least)
+        self.next_frames = [frame for frame in frames if not self._is_tracked(frame)]
+        self.revision += 1
+
+    def _stop(self, future: Future[Any]) -> None:
+        _, count = self._running.pop(future)
+        count.unlink()  # ends it
+
+    def _next_task(self) -> Task | None:
+        """The missing pass that starts next: the shortest beside the newest box of the object whose turn it is."""
+        running = [task for task, _ in self._running.values()]
+        full = [long for long in (False, True) if sum(_is_long(task) == long for task in running) >= self._jobs]
+        waiting = (task for task in self._missing if task not in running and _is_long(task) not in full)
+        return min(waiting, key=self._priority, default=None)
+
+    def _priority(self, task: Task) -> tuple[int, bool, int]:
+        is_newest = self._newest.get(task.object) in (task.start, task.stop)
+        return self._turns.get(task.object, 0), not is_newest, task.frames
+
+    def _is_tracked(self, following: NextFrame) -> bool:
+        """Return True if a missing pass may check the frame soon: none can at an end of the video without a box."""
+        frame, ends = following.frame, (0, len(self.annotation.frames) - 1)
+        return frame not in ends and any(
+            task.object == following.object and min(task.start, task.stop) <= frame <= max(task.start, task.stop)
+            for task in self._missing
+            if not (task.use_memory and _is_long(task))  # a person need not wait for it to add a box
+        )
+
+
+class Sessions:
+    """Sessions of several videos, of which one is open: its passes run. Use it in a `with`.
+
+    The others keep their boxes, finished passes and changes to undo.
+
+    Parameters
+    ----------
+    names : names of the videos
+    start : function that returns the session of a video by its number; VideoError if it cannot be read
+    shares : share of checked frames of each video so far, from 0 to 1
+
+    Attributes
+    ----------
+    names, shares : as of the parameters
+    number : number of the open video
+    """
+
+    def __init__(self, names: Sequence[str], start: Callable[[int], Session], shares: Sequence[float]) -> None:
+        self.names, self.shares, self.number = names, [*shares], 0
+        self._start, self._lock = start, threading.Lock()
+        self._sessions: dict[int, Session] = {}
+
+    def __enter__(self) -> Self:
+        self._sessions[0] = self._start(0).__enter__()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.current.__exit__()
+        for session in self._sessions.values():
+            session.annotation.close()
+
+    def __iter__(self) -> Iterator[Session]:
+        """The sessions of the videos that were opened, in their order."""
+        return (self._sessions[number] for number in sorted(self._sessions))
+
+    @property
+    def current(self) -> Session:
+        """The session of the open video."""
+        return self[self.number]
+
+    def __getitem__(self, number: int) -> Session:
+        return self._sessions[number]
+
+    def open(self, number: int) -> None:
+        """Open another video, and write the results of the previous one; VideoError if either fails."""
+        with self._lock:
+            before = self.current
+            if number == self.number or before.finished.is_set():
+                return
+            session = self._sessions.get(number) or self._start(number)
+            before.__exit__()
+            try:
+                if before.decoded and (before.annotation.keyframes or before.can_undo):
+                    self.shares[self.number] = before.annotation.share_checked
+                    before.write()
+            finally:
+                session.revision += before.revision + 1  # it never decreases for the page
+                self._sessions[number] = session.__enter__()
+                self.number = number
+
+
+def _is_long(task: Task) -> bool:
+    return task.frames > _LONG

@@ -1,0 +1,262 @@
+"""Formats of annotation tools and data sets, made from a log: COCO, CVAT for video, YOLO and VIA tracks.
+
+Frames have their numbers in the source. The image of a frame is NAME_000000.jpg, with the name of the log and the
+number of the frame; an image of a folder keeps its name, after NAME_ in a data set of several logs. A doubtful box is
+marked, except in YOLO, which has no field for it; CVAT also has `checked` of an annotation.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import shutil
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from html import escape
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from catstream.base.box import Box
+from catstream.base.text import counted
+from catstream.errors import VideoError
+from catstream.output.destinations import Head, TrackedFrame
+from catstream.video.frames import jpeg
+from catstream.video.source import open_source
+from catstream.wire.messages import Track
+
+_VIA_COLUMNS = (
+    *("filename", "file_size", "file_attributes", "region_count"),
+    *("region_id", "region_shape_attributes", "region_attributes"),
+)
+
+_CVAT_HEAD = """<?xml version="1.0" encoding="utf-8"?>
+<annotations><version>1.1</version>
+<meta><task><name>{name}</name><size>{frames}</size><mode>interpolation</mode><labels>
+{labels}
+</labels><original_size><width>{width}</width><height>{height}</height></original_size></task></meta>
+"""
+_CVAT_LABEL = (
+    "<label><name>{}</name><attributes><attribute><name>doubtful</name><mutable>True</mutable><input_type>checkbox"
+    "</input_type><default_value>false</default_value><values>false</values></attribute>{}</attributes></label>"
+)
+_CVAT_CHECKED = (
+    "<attribute><name>checked</name><mutable>True</mutable><input_type>select</input_type><default_value>unchecked"
+    "</default_value><values>unchecked\nchecked\nhidden\nkeyframe</values></attribute>"
+)
+_CVAT_BOX = (
+    '<box frame="{}" outside="{:d}" occluded="0" keyframe="1" xtl="{:.2f}" ytl="{:.2f}" xbr="{:.2f}" ybr="{:.2f}" '
+    'z_order="0"><attribute name="doubtful">{}</attribute>{}</box>\n'
+)
+
+
+@dataclass(frozen=True, slots=True)
+class About:
+    """The parameters of an export.
+
+    name     name of the log, for the images
+    head     head of the log; an empty one if the log has none
+    size     width and height of a frame in pixels; None if unknown
+    frames   number of frames of the source; None if unknown
+    label    class of all objects; empty if the name of each is its class
+    classes  names of the classes in the order of their numbers; empty for the order of the log
+    images   files of the images of the source; empty if it is a video
+    prefix   of the names of these images: those of several logs may be the same
+    source   path of the source whose images are written; empty to write none
+    is_first whether this is the first log of a data set: the labels of an earlier one are removed
+    """
+
+    name: str
+    head: Head = field(default_factory=Head)
+    size: tuple[int, int] | None = None
+    frames: int | None = None
+    label: str = ""
+    classes: Sequence[str] = ()
+    images: Sequence[Path] = ()
+    prefix: str = ""
+    source: str = ""
+    is_first: bool = True
+
+
+class _Place(NamedTuple):
+    """A box of an object. Objects are numbered from 1; an object that reuses a name has a number of its own."""
+
+    number: int
+    label: str
+    track: Track
+    box: Box
+
+
+def write_coco(frames: Iterable[TrackedFrame], path: Path, about: About) -> None:
+    """Write the objects of COCO, with the fields that TAO adds for videos and tracks; ids count from 1."""
+    classes = _numbers(frames, about, first=1)
+    images: list[dict[str, Any]] = []
+    tracks: dict[int, dict[str, Any]] = {}
+    boxes: list[dict[str, Any]] = []
+    size = _size(about)
+    for frame, places in _places(frames, about):
+        image = {"id": frame + 1, "file_name": _image(about, frame), **size}
+        images.append(image | {"video_id": 1, "frame_index": frame})
+        for number, label, track, box in places:
+            of = {"category_id": classes[label], "video_id": 1}
+            tracks[number] = {"id": number, "name": track.object, **of}
+            ids = {"id": len(boxes) + 1, "image_id": image["id"], "track_id": number, **of}
+            shape = {"bbox": [round(side, 2) for side in box], "area": round(box.area, 2), "iscrowd": 0}
+            boxes.append({**ids, **shape, "score": track.score, "attributes": {"doubtful": track.doubtful}})
+    data = {
+        "info": {"description": f"tracks of {about.name}"},
+        "videos": [{"id": 1, "name": about.name, **size}],
+        "images": images,
+        "categories": [{"id": number, "name": name} for name, number in classes.items()],
+        "tracks": [*tracks.values()],
+        "annotations": boxes,
+    }
+    path.write_text(json.dumps(data), encoding="utf-8")
+
+
+def write_cvat(frames: Iterable[TrackedFrame], path: Path, about: About) -> str:
+    """Write `CVAT for video 1.1`: a keyframe for each box, and an outside keyframe where the object disappears.
+
+    CVAT drops boxes that are not keyframes, and interpolates. So the attribute `checked` marks the boxes that a person
+    drew in an annotation.
+
+    CVAT refuses a file with a frame that its video does not have, so a track that reaches the last frame of the source
+    has no such end. If `about.frames` is None, this is the last frame of the log; returns a line that says so.
+    """
+    objects: dict[int, list[_Place]] = {}
+    end, step = 0, about.head.stride
+    for frame, places in _places(frames, about):
+        end = frame + 1
+        for place in places:
+            objects.setdefault(place.number, []).append(place)
+    note = "" if about.frames else "the video was not read: its last frame is assumed to be the last tracked one"
+    end = about.frames or end
+    checked = any(place.track.checked for places in objects.values() for place in places)
+    labels = (_CVAT_LABEL.format(escape(name), _CVAT_CHECKED if checked else "") for name in _numbers(frames, about))
+    with path.open("w", encoding="utf-8") as file:
+        kinds = "\n".join(labels)
+        file.write(_CVAT_HEAD.format(name=escape(about.name), frames=end, labels=kinds, **_size(about)))
+        for number, places in objects.items():
+            file.write(f'<track id="{number - 1}" label="{escape(places[0].label)}" source="auto">\n')
+            following = [*(place.track.source_frame for place in places[1:]), end]
+            for place, after in zip(places, following, strict=True):
+                frame, (x, y, w, h) = place.track.source_frame, place.box
+                check = f'<attribute name="checked">{place.track.checked}</attribute>' if checked else ""
+                rest = x, y, x + w, y + h, str(place.track.doubtful).lower(), check
+                file.write(_CVAT_BOX.format(frame, False, *rest))
+                if frame + step < after:
+                    file.write(_CVAT_BOX.format(frame + step, True, *rest))
+            file.write("</track>\n")
+        file.write("</annotations>\n")
+    return note
+
+
+def write_yolo(frames: Iterable[TrackedFrame], folder: Path, about: About) -> None:
+    """Write the labels of a YOLO data set, `class x y w h` of the centre in parts of the frame, and its data.yaml.
+
+    There is a file for each frame, which is empty if there is no box.
+    """
+    classes, labels = _numbers(frames, about), folder / "labels"
+    labels.mkdir(parents=True, exist_ok=True)
+    (folder / "labels.cache").unlink(missing_ok=True)  # Ultralytics takes it for the cache of other labels of this size
+    for file in labels.glob("*.txt") if about.is_first else ():
+        file.unlink()
+    names = "".join(f"  {number}: {json.dumps(name, ensure_ascii=False)}\n" for name, number in classes.items())
+    (folder / "data.yaml").write_text(f"train: images\nval: images\nnames:\n{names}", encoding="utf-8")
+    width, height = _size(about).values()
+    for frame, places in _places(frames, about):
+        lines = []
+        for _, label, _, box in places:
+            x, y = box.centre
+            sides = x / width, y / height, box.w / width, box.h / height
+            lines.append(f"{classes[label]} {' '.join(f'{side:.6f}' for side in sides)}\n")
+        (labels / f"{Path(_image(about, frame)).stem}.txt").write_text("".join(lines))
+    if about.source:
+        _write_images(frames, folder / "images", about)
+
+
+def _write_images(frames: Iterable[TrackedFrame], folder: Path, about: About) -> None:
+    """Write the images of the tracked frames: copies of the files of a folder, otherwise JPEG. Existing files stay."""
+    numbers = {frame.tracks[0].source_frame for frame in frames}
+    folder.mkdir(exist_ok=True)
+    missing = {number for number in numbers if not (folder / _image(about, number)).exists()}
+    for number in missing if about.images else ():
+        shutil.copyfile(about.images[number], folder / _image(about, number))
+    if missing and not about.images:
+        with open_source(about.source, part=slice(min(missing), max(missing) + 1)) as source:
+            for number, frame in enumerate(source, min(missing)):
+                if number in missing:
+                    (folder / _image(about, number)).write_bytes(jpeg(frame.image, quality=95))
+
+
+def write_via(frames: Iterable[TrackedFrame], path: Path, about: About) -> None:
+    """Write the tracks of the VGG Image Annotator, one row for each box, as movement and napari read them."""
+    with path.open("w", encoding="utf-8", newline="") as file:
+        rows = csv.writer(file)
+        rows.writerow(_VIA_COLUMNS)
+        for frame, places in _places(frames, about):
+            for index, (number, label, track, (x, y, w, h)) in enumerate(places):
+                shape = {"name": "rect", "x": x, "y": y, "width": w, "height": h}
+                attributes = {
+                    "track": number,
+                    "confidence": track.score,
+                    "class": label,
+                    "doubtful": int(track.doubtful),
+                }
+                cells = [json.dumps(fields, ensure_ascii=False) for fields in ({"frame": frame}, shape, attributes)]
+                rows.writerow([_image(about, frame), -1, cells[0], len(places), index, *cells[1:]])
+
+
+def _places(frames: Iterable[TrackedFrame], about: About) -> Iterator[tuple[int, list[_Place]]]:
+    """Yield each frame's number in the source and its boxes, cut at the edges of the frame if its size is known."""
+    numbers: dict[tuple[str, int], int] = {}
+    for frame in frames:
+        places = []
+        for track in frame.tracks:
+            number = numbers.setdefault((track.object, track.began), len(numbers) + 1)
+            if (box := _cut(track.box, about.size)) is not None:
+                places.append(_Place(number, _label(track, about.label), track, box))
+        yield frame.tracks[0].source_frame, places
+
+
+def _numbers(frames: Iterable[TrackedFrame], about: About, *, first: int = 0) -> dict[str, int]:
+    """Return the number of each class, in the order of `about.classes`, or else of the log.
+
+    An object that is never present has a class. Raises VideoError if `about.classes` lacks one.
+    """
+    found = classes_of(frames, about.label)
+    if about.classes and (lacking := [name for name in found if name not in about.classes]):
+        raise VideoError(f"--classes lacks {lacking[0]!r}: add it, or give all objects one class with --label")
+    return {name: number for number, name in enumerate(about.classes or found, first)}
+
+
+def classes_of(frames: Iterable[TrackedFrame], label: str) -> list[str]:
+    """Return the classes of a log, in the order of their first tracks."""
+    return [*dict.fromkeys(_label(track, label) for frame in frames for track in frame.tracks)]
+
+
+def _label(track: Track, label: str) -> str:
+    return label or track.object or "object"
+
+
+def _cut(box: Box | None, size: tuple[int, int] | None) -> Box | None:
+    """Return the part of a box that is in the frame; None if there is none."""
+    if box is None or size is None:
+        return box
+    x, y = max(box.x, 0.0), max(box.y, 0.0)
+    w, h = min(box.x + box.w, size[0]) - x, min(box.y + box.h, size[1]) - y
+    return Box(x, y, w, h) if w > 0 and h > 0 else None
+
+
+def _size(about: About) -> dict[str, int]:
+    width, height = about.size or (0, 0)  # the formats that need it are not made without it
+    return {"width": width, "height": height}
+
+
+def _image(about: About, frame: int) -> str:
+    """The file name of the image of a frame."""
+    if not about.images:
+        return f"{about.name}_{frame:06d}.jpg"
+    if frame >= len(about.images):
+        count = counted(len(about.images), "image")
+        raise VideoError(f"the log has frame {frame}, but its folder has {count}: pass another one (--source)")
+    return about.prefix + about.images[frame].name

@@ -1,0 +1,277 @@
+"""THE TABLE of destinations of tracks.
+
+A sink takes each frame while the run goes on: `catstream track --write DEST`, `catstream sink DEST`. A new one is a row
+here, a class in a file of its own, and a line in docs/how-to/sinks.md. `catstream.output.exports` has the formats that
+are made from a log afterwards.
+"""
+
+from __future__ import annotations
+
+import json
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from importlib import import_module
+from importlib.metadata import version
+from math import nan
+from pathlib import Path
+from typing import Any, NamedTuple, Self, cast
+
+import msgspec
+
+from catstream.base.addresses import is_live, without_password
+from catstream.base.box import Box
+from catstream.base.files import check_file, check_unlocked
+from catstream.client.address import Address
+from catstream.errors import VideoError
+from catstream.output.events import WHEN, Point
+from catstream.video.images import IMAGES
+from catstream.video.source import VIDEOS
+from catstream.wire.messages import Track
+
+#: Stands for standard output.
+STDOUT = "-"
+
+#: Version of the format of a log, in its head.
+FORMAT = 1
+
+
+class TrackedFrame(NamedTuple):
+    """The tracks of a frame, at least one; a subscriber receives them one by one, and passes on one at a time.
+
+    seconds  processing time of the frame, NaN if it is not known
+    """
+
+    tracks: Sequence[Track]
+    seconds: float = nan
+
+    @property
+    def number(self) -> int:
+        return self.tracks[0].frame
+
+
+@dataclass(frozen=True, slots=True)
+class Head:
+    """The first line of an NDJSON log, as JSON, and the table `head` of a database: the run that its tracks are of.
+
+    catstream  version of the format of the log
+    frame      -1: a program that reads the number of the frame in each line reads the head before frame 0
+    source     path or address of the source, without a password; empty beside a running pipeline
+    size       width and height of a frame, pixels; None if unknown
+    rate       frames per second of the source; None if unknown
+    frames     number of frames that the run tracks; None if unknown, or if the source is live
+    start      number in the source of the first tracked frame
+    stride     the run tracks every `stride`-th frame of the source
+    version    version of the program
+    settings   NAME=VALUE of each setting that differs from its default
+    boxes      initial box of each object that the run started with, by name
+    gap        0; in a further head, the number of frames before it that could not be written, as the disk was full
+    """
+
+    catstream: int = FORMAT
+    frame: int = -1
+    source: str = ""
+    size: tuple[int, int] | None = None
+    rate: float | None = None
+    frames: int | None = None
+    start: int = 0
+    stride: int = 1
+    version: str = field(default_factory=partial(version, "catstream"))
+    settings: tuple[str, ...] = ()
+    boxes: dict[str, Box] = field(default_factory=dict)
+    gap: int = 0
+
+    def to_json(self) -> str:
+        return msgspec.json.encode(self).decode()
+
+    @classmethod
+    def from_json(cls, text: str | bytes) -> Self | None:
+        """Read the head of a log; None if the text is not a head, VideoError if it is from another version."""
+        try:
+            written = json.loads(text)["catstream"]
+        except (ValueError, TypeError, KeyError):
+            return None
+        if written != FORMAT:
+            raise VideoError(
+                f"the log has version {written} of its format, expected {FORMAT}: read it with the catstream that "
+                "wrote it"
+            )
+        try:
+            return msgspec.json.decode(text, type=cls)
+        except msgspec.ValidationError as error:
+            raise VideoError(f"the head of the log is invalid ({error})") from None
+
+
+class Rotation(NamedTuple):
+    """When a log is renamed and a new one begins: in a new period of these seconds in UTC, or above these bytes."""
+
+    seconds: float
+    bytes: float
+
+
+@dataclass(frozen=True, slots=True)
+class SinkOptions:
+    """Options of the destinations; `catstream.output.options` has their table.
+
+    zone         corners of each zone, a polygon in pixels of the frame, by name
+    when         kinds of events that are sent, see `catstream.output.events.WHEN`
+    rate         messages per second about each object, at most, between its events
+    picture      whether each event has the newest picture of the pipeline
+    secret_file  file of the key that signs events; None to sign nothing
+    megabytes    limit of the size of a folder
+    rotate       when the logs of a live source are renamed; None for never
+    keep         number of renamed logs that remain, 0 for all
+    """
+
+    zone: dict[str, tuple[Point, ...]] = field(default_factory=dict)
+    when: dict[str, float] = field(default_factory=WHEN.copy)
+    rate: float = 1.0
+    picture: bool = False
+    secret_file: Path | None = None
+    megabytes: float = 1000.0
+    rotate: Rotation | None = None
+    keep: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Origin:
+    """The run whose tracks a sink writes.
+
+    head      of its log
+    address   of the running pipeline, for a sink that also receives pictures
+    options   of the destinations
+    attached  whether another program runs the pipeline: its source is not read a second time
+    last      last frame of the file if it is a log that is continued; None for a new file
+    size      number of bytes up to the end of that frame
+    gap       frames that could not be written because the sink could not be opened
+    """
+
+    head: Head = field(default_factory=Head)
+    address: Address = field(default_factory=Address)
+    options: SinkOptions = field(default_factory=SinkOptions)
+    attached: bool = False
+    last: TrackedFrame | None = None
+    size: int = 0
+    gap: int = 0
+
+
+class Sink(ABC):
+    """Writes the frames in their order; created as `Class(place, origin)`.
+
+    Its class may have a function `check(place, options)`, which raises VideoError before the run if the address or an
+    option is not valid.
+
+    missed  frames or messages that were dropped, as the destination was locked, slow or away
+    """
+
+    missed = 0
+
+    @abstractmethod
+    def write(self, frame: TrackedFrame) -> None:
+        """Add a frame; raise VideoError if that is not possible."""
+
+    def idle(self) -> object:  # noqa: B027  # optional
+        """Continue without a frame; called every few seconds while none arrives."""
+
+    def end(self) -> object:  # noqa: B027
+        """Send the last events, without waiting until they have arrived; called before any sink is closed."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Complete the output; raise VideoError if that is not possible."""
+
+
+class Row(NamedTuple):
+    """A row of the table: the class of a sink, as module.Class, and a line of the help."""
+
+    home: str
+    meaning: str
+
+    def load(self) -> Any:
+        """Import the class."""
+        module, _, name = self.home.rpartition(".")
+        return getattr(import_module(f"catstream.output.{module}"), name)
+
+
+#: The suffix of a file, the scheme of an address such as "mqtt://", "/" for a folder, or "-" -> the sink.
+SINKS = {
+    ".ndjson": Row("track_log.NdjsonSink", "the log: one JSON object per line, after a head"),
+    STDOUT: Row("track_log.StdoutSink", "the same, without the head, on standard output"),
+    ".csv": Row("track_log.CsvSink", "a row for each object and frame: frame, seconds, state, box, score ..."),
+    ".sqlite": Row("database.SqliteSink", "the table tracks of a database, which others read meanwhile"),
+    ".mp4": Row("video_sink.open_video", "the frames with their boxes drawn in"),
+    "mqtt://": Row("mqtt_sink.MqttSink", "HOST/TOPIC: events and states of objects, for a broker"),
+    "mqtts://": Row("mqtt_sink.MqttSink", "the same with TLS"),
+    "http://": Row("webhook.Webhook", "HOST/PATH: each event as JSON, by POST"),
+    "https://": Row("webhook.Webhook", "the same with TLS"),
+    "/": Row("events_folder.EventsFolder", "a folder, DIR/: each event in events.ndjson, and its picture as JPEG"),
+}
+
+
+def kind_of(place: str) -> str:
+    """Return the key of a destination in `SINKS`, or what would be its key.
+
+    >>> kind_of("out/walk.csv"), kind_of("mqtt://host/yard"), kind_of("events/"), kind_of("-")
+    ('.csv', 'mqtt://', '/', '-')
+    """
+    scheme, mark, _ = place.partition("://")
+    if mark or place == STDOUT:
+        return scheme + mark
+    return "/" if place.endswith("/") else Path(place).suffix
+
+
+def sink_of(place: str) -> Row:
+    """Return the row of a destination; raises VideoError if there is none."""
+    row = SINKS.get(kind_of(place))
+    if row is None:
+        raise VideoError(
+            f"{redacted(place)} is not a destination of tracks: pass a file or address with one of {', '.join(SINKS)}, "
+            "where - is standard output, and / ends the name of a folder; for other formats use catstream export"
+        )
+    return row
+
+
+def is_file(place: str) -> bool:
+    """Return whether a destination is a file: not standard output, no address, and no folder."""
+    return place != STDOUT and "://" not in place and not place.endswith("/")
+
+
+def check_result(path: Path, *, overwrite: bool, source: str = "", made: Path | None = None) -> None:
+    """Raise VideoError if a file is of the source, if another process writes it, or as `files.check_file` does."""
+    if source and path.exists() and Path(source).exists() and path.samefile(source):
+        raise VideoError(f"{path} is the source, which would be lost: use another name or folder")
+    if Path(source).is_dir() and path.exists() and path.suffix in VIDEOS | IMAGES and Path(source) in path.parents:
+        raise VideoError(f"{path} is in the folder of the source, and may be its video: use another name or folder")
+    check_unlocked(path, VideoError)
+    check_file(path, overwrite=overwrite, made=made, kind=VideoError, may_wait=is_live(source))
+
+
+def check_sink(place: str, options: SinkOptions, source: str = "") -> None:
+    """Raise VideoError if there is no such destination, or the address or an option is invalid.
+
+    Also if it is the video of a live `source`.
+    """
+    home = sink_of(place).load()
+    if is_file(place) and place.endswith(".mp4") and is_live(source):
+        raise VideoError(f"a video needs its frames once more, but {source} is live: omit the video")
+    if hasattr(home, "check"):
+        home.check(place, options)
+
+
+def redacted(place: str) -> str:
+    """Return a destination as messages name it: an address without its password, of a webhook its host alone.
+
+    >>> redacted("mqtt://me:secret@10.0.0.7/yard"), redacted("https://example.com/hooks/T0/B0/secret")
+    ('mqtt://10.0.0.7/yard', 'https://example.com/...')
+    """
+    if is_file(place):
+        return place
+    address = without_password(place)
+    scheme, _, rest = address.partition("://")
+    return f"{scheme}://{rest.partition('/')[0]}/..." if scheme in ("http", "https") else address
+
+
+def open_sink(place: str, origin: Origin) -> Sink:
+    """Open the sink of a destination; raises VideoError if that is not possible."""
+    return cast(Sink, sink_of(place).load()(place, origin))

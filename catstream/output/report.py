@@ -1,0 +1,47 @@
+"""Reports: self-contained HTML pages for any display, made from the templates in `templates/`."""
+
+from __future__ import annotations
+
+import base64
+from functools import cache
+from pathlib import Path
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+
+from catstream.base.files import write_atomically, writing
+
+#: Colours of the curves, in order; distinguishable for colour-blind people, on light and on dark background.
+COLOURS = ("#f25100", "#2b82d9", "#56bf9c", "#a63700", "#30b2f2", "#3f8c7f", "#1c678c")
+
+
+def write_page(path: Path, template: str, **values: object) -> Path:
+    """Write the page of a template atomically; all values are escaped."""
+    page = _environment().get_template(template).render(values)
+    with writing(path):
+        write_atomically(path, page.encode(errors="surrogateescape"))  # the name of a file need not be UTF-8
+    return path
+
+
+@cache
+def _environment() -> Environment:
+    environment = Environment(
+        loader=PackageLoader("catstream.output"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters["clock"] = clock
+    environment.filters["base64"] = lambda data: base64.b64encode(data).decode("ascii")
+    return environment
+
+
+def clock(seconds: float) -> str:
+    """Format a time.
+
+    >>> clock(75.25), clock(3675)
+    ('1:15.2', '1:01:15.0')
+    """
+    minutes, rest = divmod(round(seconds * 10), 600)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02}:{rest / 10:04.1f}" if hours else f"{minutes}:{rest / 10:04.1f}"

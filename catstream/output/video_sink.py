@@ -1,0 +1,87 @@
+"""The video with its tracks drawn in, from the frames of a source, or from the pictures of a running pipeline."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+
+from catstream.client.attach import subscribe
+from catstream.errors import SilenceError, VideoError
+from catstream.output.destinations import Head, Origin, Sink, TrackedFrame
+from catstream.video.drawing import Colours, draw, drawn_size, preview_image
+from catstream.video.frames import RATE
+from catstream.video.source import open_source
+from catstream.video.writer import VideoWriter
+from catstream.wire.messages import Preview, Track
+
+_BACKLOG = 256  # frames whose tracks wait for their picture
+
+
+def open_video(place: str, origin: Origin) -> Sink:
+    """Open an MP4 of the frames of a source if they can be read a second time, else of the pipeline's pictures."""
+    return PictureVideo(place, origin) if origin.attached else SourceVideo(place, origin.head)
+
+
+class SourceVideo(Sink):
+    """An MP4 of the frames that have a track, with their tracks drawn in."""
+
+    def __init__(self, place: str, head: Head) -> None:
+        # The pipeline skips damaged frames and scales others, or ends at the first: in any case these are its frames.
+        part = slice(head.start, None, head.stride)
+        self._frames = open_source(head.source, part=part, image_rate=head.rate or RATE, skip_damaged=True, resize=True)
+        self._colours = Colours()
+        try:
+            aspect = self._frames.pixel_aspect
+            size, rate = drawn_size(self._frames.size), self._frames.rate
+            self._video = VideoWriter(place, rate, size, pixel_aspect=aspect)
+        except VideoError:
+            self._frames.close()
+            raise
+
+    def write(self, frame: TrackedFrame) -> None:
+        image = next((source.image for source in self._frames if source.number == frame.number), None)
+        if image is None:
+            raise VideoError(f"the source has no frame {frame.number}: pass the source that the pipeline tracks")
+        self._colours.keep(track.object for track in frame.tracks)
+        self._video.write(draw(image, frame.tracks, self._colours), frame.tracks[0].time)
+
+    def close(self) -> None:
+        self._frames.close()
+        self._video.close()
+
+
+class PictureVideo(Sink):
+    """An MP4 of the small pictures that a running pipeline sends, with their tracks drawn in, at their true times."""
+
+    def __init__(self, place: str, origin: Origin) -> None:
+        self._place, self._colours = place, Colours()
+        self._previews = subscribe(origin.address, "previews", timeout=0)
+        self._tracks: dict[int, list[Track]] = {}  # of the newest frames, by the number of the frame
+        self._picture: Preview | None = None  # not drawn yet: its frame may have further tracks
+        self._video: VideoWriter | None = None
+
+    def write(self, frame: TrackedFrame) -> None:
+        """Add tracks, and the next picture whose frame has all its tracks."""
+        self._tracks.setdefault(frame.number, []).extend(frame.tracks)
+        if len(self._tracks) > _BACKLOG:
+            del self._tracks[next(iter(self._tracks))]
+        if self._picture is None:
+            with suppress(SilenceError):
+                self._picture = next(self._previews, None)
+        if self._picture is None or self._picture.frame >= frame.number:
+            return
+        picture, self._picture = self._picture, None
+        tracks = self._tracks.get(picture.frame, [])
+        image = preview_image(picture, tracks, self._colours) if tracks else None
+        if image is not None:
+            self._colours.keep(track.object for track in tracks)
+            size = (image.shape[1], image.shape[0])
+            self._video = self._video or VideoWriter(self._place, RATE, size)
+            self._video.write(image, tracks[0].time)
+
+    def close(self) -> None:
+        self._previews.close()
+        if self._video is None:
+            raise VideoError(
+                f"{self._place} was not written: the pipeline sent no picture of a frame that was received"
+            )
+        self._video.close()

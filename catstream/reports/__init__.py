@@ -1,1 +1,0 @@
-"""The HTML of reports, and the provenance of their figures."""

@@ -1,0 +1,142 @@
+"""Limits and plans, and real runs: pipelines on a camera that does not wait, also if they are ended early."""
+
+import psutil
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from catstream.base.settings import Settings
+from catstream.errors import ServiceError, SettingsError
+from catstream.measure import load_test as module
+from catstream.measure.load_report import to_json
+from catstream.measure.load_result import Limit, Plan, violations
+from catstream.measure.load_test import find_highest, run_load_test
+
+
+def children():
+    """Processes of this one, but for the start server and the resource tracker, which stay to its end."""
+    servers = ("processes.start_server", "resource_tracker")
+    stay = [child for child in psutil.Process().children() if any(name in str(child.cmdline()) for name in servers)]
+    return [child for child in psutil.Process().children(recursive=True) if child not in stay]
+
+
+def test_interrupted_run_returns_its_measurements_and_leaves_no_process():
+    def tell(_, share, figures):
+        if share > 0.05 and "tracks" in figures:
+            raise KeyboardInterrupt
+
+    plan = Plan(rate=20.0, duration=20.0, size=(320, 240), source="h264")
+    load_test = run_load_test(plan, [Limit("p99", 60.0)], report=tell)
+    assert load_test.interrupted
+    assert load_test.violations == []
+    (stream,) = load_test.result.streams
+    assert 10 <= stream.frames < plan.frames
+    assert stream.frames == len(stream.track)
+    assert load_test.result.seconds == pytest.approx(stream.frames / 20)
+    assert stream.totals["sent"] == stream.totals["stored"] > stream.frames  # what it learned before counts too
+    assert children() == []
+
+
+def test_still_before_the_first_frame_is_not_taken_for_it_at_a_low_rate():
+    settings = Settings(run={"endpoint": "run"})  # of the only pipeline of a shell; those of a load test have their own
+    load_test = run_load_test(Plan(rate=1.0, duration=1.0, size=(64, 64), settings=settings), [])
+    (stream,) = load_test.result.streams
+    assert stream.track[0] > 0
+
+
+@pytest.fixture
+def machine(monkeypatch, result):
+    """Makes a machine that serves so many streams, and starts at most `most`; returns the numbers that were tried."""
+
+    def made(capacity, most=64):
+        tried = []
+
+        def run(plan, *_):
+            tried.append(plan.streams)
+            if plan.streams > most:
+                raise ServiceError("it took too long")
+            tracked = 1.0 if plan.streams <= capacity else 0.9
+            run = result(*[[0.01] * 50] * plan.streams, tracked=tracked)
+            run.plan = plan
+            return run
+
+        monkeypatch.setattr(module, "run", run)
+        monkeypatch.setattr(module, "render", lambda *_: None)
+        return tried
+
+    return made
+
+
+@pytest.mark.parametrize(
+    ("facts", "start", "steps", "highest"),
+    [
+        ({"capacity": 6}, 1, [1, 2, 4, 8, 6, 7], 6),
+        ({"capacity": 6, "most": 6}, 1, [1, 2, 4, 8, 6, 7], 6),
+        ({"capacity": 3}, 8, [8, 4, 2, 3], 3),
+        ({"capacity": 99}, 40, [40, 64], 64),
+        ({"capacity": 0}, 2, [2, 1], None),
+    ],
+)
+def test_number_of_streams_is_doubled_or_halved_and_bisected(machine, facts, start, steps, highest):
+    tried = machine(**facts)
+    load_test = run_load_test(Plan(streams=start), [Limit("skipped", 0.0)], find=True)
+    assert (tried, load_test.highest) == (steps, highest)
+    assert load_test.result.plan.streams == (highest or 1)
+    assert load_test.violations == ([] if highest else ["no number of streams meets skipped=0: the lowest tried was 1"])
+    assert to_json(load_test)["highest_streams"] == highest
+
+
+def test_streams_that_do_not_start_are_a_step_of_a_search_but_not_the_first_one(machine):
+    machine(capacity=6, most=4)
+    assert run_load_test(Plan(), [], find=True).refused == dict.fromkeys((8, 6, 5), "it took too long")
+    machine(capacity=6, most=0)
+    with pytest.raises(ServiceError, match="it took too long"):
+        run_load_test(Plan(), [], find=True)
+
+
+def test_limit_applies_to_the_worst_stream(result):
+    run = result([0.01] * 100, [0.01] * 90 + [0.2] * 10)
+    assert violations([Limit("p99", 0.1)], run) == ["p99 is 200 ms, limit at most 100 ms (from a frame to its track)"]
+    assert violations([Limit("p99", 0.2), Limit("p50", 0.01), Limit("max", 0.2), Limit("success", 0.9)], run) == []
+    assert violations([Limit("success", 0.95)], run) == [
+        "success is 0.9, limit at least 0.95 (share of frames with an IoU above 0.5)"
+    ]
+
+
+def test_failed_stream_is_a_violation_beside_missed_frames(result):
+    run = result([0.01] * 10, received=[99, 99], missed=[1, 1], errors=["stream 0: it died"])
+    assert violations([Limit("missed", 0.01)], run) == ["stream 0: it died"]
+    assert "limit at most 0.009" in violations([Limit("missed", 0.009)], run)[1]
+
+
+@pytest.mark.parametrize("text", ["p98=0.1", "p99", "p99=fast", "p99=-1", "p99=nan"])
+def test_malformed_limit_is_an_error(text):
+    with pytest.raises(SettingsError, match=r"NAME=VALUE with one of p50, .*for example p99=0\.1"):
+        Limit.parse(text)
+
+
+@pytest.mark.parametrize(
+    ("facts", "said"),
+    [
+        ({"rate": 0.5, "duration": 0.9}, "no frame is due"),
+        ({"size": (321, 240), "source": "h264"}, "an even width"),
+        ({"settings": Settings(run={"lockstep": True})}, "omit run.lockstep"),
+        ({"slow_subscribers": 1}, "more slow subscribers"),
+    ],
+)
+def test_contradictory_plan_is_an_error(facts, said):
+    with pytest.raises(SettingsError, match=said):
+        Plan(**facts)
+
+
+@given(st.integers(1, 64), st.integers(0, 80))
+def test_search_finds_the_highest_number_and_tries_each_number_once(start, capacity):
+    tried = []
+
+    def holds(streams):
+        tried.append(streams)
+        return streams <= capacity
+
+    assert (find_highest(start, holds, most=64) or 0) == min(capacity, 64)
+    assert len(tried) == len(set(tried)) <= 12
+    assert all(1 <= streams <= 64 for streams in tried)

@@ -1,0 +1,159 @@
+"""Annotation of a rendered video: what is tracked, what is checked, and which frame is asked for."""
+
+import multiprocessing
+import shutil
+
+import pytest
+
+from catstream.base.box import Box
+from catstream.errors import BoxError, ObjectError, VideoError
+from catstream.offline import annotation as module
+from catstream.offline.annotation import Annotation, annotate
+
+FRAMES = 24
+
+
+@pytest.fixture(scope="module")
+def demo(demo_video):
+    return demo_video(FRAMES)
+
+
+@pytest.fixture(scope="module")
+def both_ends(demo):
+    """The annotation of the video with its object's boxes in the first and the last frame."""
+    video, truth = demo
+    with annotate(video, {"anna": {0: truth[0], FRAMES - 1: truth[-1]}}, jobs=1) as annotation:
+        yield annotation
+
+
+def test_an_object_that_is_easy_to_track_is_checked_from_two_boxes(demo, both_ends):
+    _, truth = demo
+    tracks = both_ends.tracks["anna"]
+    assert all(track.box.overlap(box) > 0.5 for track, box in zip(tracks, truth, strict=True))
+    assert [(track.frame, track.object) for track in tracks] == [(frame, "anna") for frame in range(FRAMES)]
+    assert tracks[-1].time == both_ends.frames.times[-1] > 0
+    assert [(tracks[end].box, tracks[end].probability) for end in (0, -1)] == [(truth[0], 1), (truth[-1], 1)]
+    assert both_ends.checked["anna"] == ["keyframe", *["checked"] * (FRAMES - 2), "keyframe"]
+    assert both_ends.share_checked == 1
+    assert both_ends.next_frame() is None
+
+
+def test_single_box_leaves_the_other_frames_unchecked(demo):
+    video, truth = demo
+    with annotate(video, {3: truth[3]}, jobs=1) as annotation:
+        assert all(track.box is not None for track in annotation.tracks[""])
+        assert annotation.checked[""].count("unchecked") == FRAMES - 1
+        assert annotation.next_frame().frame == FRAMES - 1
+        assert {question.frame for question in annotation.next_frames()} == {0, FRAMES - 1}
+
+
+def test_a_box_that_is_added_is_tracked_from_and_earlier_passes_remain(demo):
+    video, truth = demo
+    with annotate(video, {0: truth[0], 12: truth[12], FRAMES - 1: truth[-1]}, jobs=1) as annotation:
+        before = annotation.passes()
+        annotation.add(18, truth[18])
+        added = [one for one in annotation.passes() if one not in before]
+        assert len(annotation.passes()) == len(before) + len(added)
+        assert {(one.start, one.stop) for one in added} == {(18, 12), (18, FRAMES - 1)}
+
+
+def test_a_box_that_is_replaced_drops_what_was_tracked_from_it(demo):
+    video, truth = demo
+    wrong = truth[-1].centred(60, 60)
+    with annotate(video, {0: truth[0], FRAMES - 1: wrong}, jobs=1) as annotation:
+        before = annotation.passes()
+        annotation.add(FRAMES - 1, truth[-1])
+        assert {one.start for one in annotation.passes() if one in before} == {0}
+        assert annotation.share_checked == 1
+
+
+def test_two_processes_give_the_same_tracks_as_one_and_remain_for_added_boxes(demo, both_ends):
+    video, truth = demo
+    with annotate(video, {"anna": {0: truth[0], FRAMES - 1: truth[-1]}}, jobs=2) as annotation:
+        assert [*annotation.tracks["anna"]] == [*both_ends.tracks["anna"]]
+        processes = {*multiprocessing.active_children()}
+        annotation.add(12, truth[12], "anna")
+        assert {*multiprocessing.active_children()} == processes
+    assert not multiprocessing.active_children()
+
+
+def test_absent_object_has_no_box(demo):
+    video, truth = demo
+    with annotate(video, {0: truth[0], FRAMES - 1: None}, jobs=1) as annotation:
+        assert annotation.tracks[""][-1].state == "absent"
+        annotation.add(FRAMES - 1, truth[-1])
+        assert annotation.tracks[""][-1].box == truth[-1]
+
+
+def test_a_hidden_object_keeps_its_estimated_box_and_is_not_asked_for_there(demo):
+    video, truth = demo
+    with annotate(video, {0: truth[0]}, jobs=1) as annotation:
+        passes, tracks = annotation.passes(), annotation.tracks[""]
+        asked = []
+        for _ in range(3):
+            asked.append(annotation.next_frame().frame)
+            annotation.add(asked[-1], "hidden")
+        assert len({*asked}) == 3
+        assert annotation.passes() == passes
+        assert [track.box for track in annotation.tracks[""]] == [track.box for track in tracks]
+        assert [annotation.checked[""][frame] for frame in (0, *asked)] == ["keyframe", *["hidden"] * 3]
+
+
+def test_finished_passes_remain_after_ctrl_c(demo, monkeypatch):
+    video, truth = demo
+    work, started = module._work, []
+
+    def interrupted(*task):
+        started.append(task)
+        if len(started) == 2:
+            raise KeyboardInterrupt
+        return work(*task)
+
+    monkeypatch.setattr(module, "_work", interrupted)
+    with Annotation(video, {0: truth[0], FRAMES - 1: truth[-1]}, jobs=1) as annotation:
+        with pytest.raises(KeyboardInterrupt):
+            annotation.track()
+        assert len(annotation.passes()) == 1
+        assert annotation.tracks[""][5].box is not None
+        annotation.track()
+        assert len(annotation.passes()) == 2
+
+
+def test_no_file_remains_and_none_holds_the_frames(demo, tmp_path, monkeypatch):
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    with annotate(demo[0], {0: demo[1][0], FRAMES - 1: demo[1][-1]}, jobs=1) as annotation:
+        sizes = [file.stat().st_size for file in tmp_path.rglob("*") if file.is_file()]
+        assert sum(sizes) < annotation.frames[0].nbytes
+    with pytest.raises(BoxError):
+        annotate(demo[0], {99: demo[1][0]})
+    assert not [*tmp_path.iterdir()]
+
+
+def test_the_frames_before_damage_that_a_pass_meets_are_tracked(walk, tmp_path):
+    images = shutil.copytree(walk / "img", tmp_path / "img")
+    (images / "0006.png").write_bytes(b"no image")
+    with Annotation(images, {0: (20, 20, 30, 30)}, jobs=1) as annotation:
+        with pytest.raises(VideoError, match=r"^5 frames could be read: .*0006\.png"):
+            annotation.track()
+        annotation.track()
+        assert len(annotation.tracks[""]) == 5
+
+
+@pytest.mark.parametrize(
+    ("boxes", "error", "message"),
+    [
+        ({FRAMES: (1, 2, 30, 40)}, BoxError, "frame 24 is outside the video: pass a frame from 0 to 23"),
+        ({"anna": {0: (400, 2, 30, 40)}}, BoxError, "anna: the box .* outside the frame"),
+        ({"anna": {0: None}}, ObjectError, "anna has no box"),
+        ({}, ObjectError, "no object"),
+        ({"a b": {0: (1, 2, 30, 40)}}, ObjectError, "not a name"),
+    ],
+)
+def test_boxes_that_cannot_be_tracked_are_an_error(demo, boxes, error, message):
+    with pytest.raises(error, match=message):
+        annotate(demo[0], boxes)
+
+
+def test_a_live_source_is_an_error():
+    with pytest.raises(VideoError, match="a live source"):
+        annotate("rtsp://10.0.0.7/stream", {0: Box(1, 2, 30, 40)})

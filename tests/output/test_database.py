@@ -1,0 +1,135 @@
+"""The database of a run: each frame is in it at once, others read it meanwhile, and a resumed run continues it."""
+
+import json
+import signal
+import sqlite3
+import subprocess
+import sys
+from contextlib import closing
+from dataclasses import replace
+
+import pytest
+
+from catstream.base.box import Box
+from catstream.errors import VideoError
+from catstream.output import remote
+from catstream.output.destinations import Head, Origin, TrackedFrame, open_sink
+from catstream.output.track_log import Log, RunFiles
+from catstream.wire.messages import Track
+
+TRACKS = [
+    Track(0, 0.0, "bootstrapping", Box(1 / 3, 20.0, 30.5, 40.0), 1.0, 0, checked="keyframe", probability=1.0),
+    Track(1, 0.04, "absent", None, 0.125, 3, 17.5, "anna", 1),
+    Track(3, 0.12, "present", Box(-2.0, 21.0, 30.0, 40.0), 0.43, 4, 18.5, "anna", 1, doubtful=True),
+]
+
+KILLED = """
+import json, os, signal, sys
+from pathlib import Path
+from catstream.output.destinations import Origin, TrackedFrame, open_sink
+from catstream.output.track_log import Log
+sink = open_sink(sys.argv[1], Origin())
+for frame in Log(Path(sys.argv[2])):
+    sink.write(frame)
+os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def read(path):
+    return [frame.tracks for frame in Log(path)]
+
+
+def test_each_frame_is_in_the_database_at_once_for_others_who_do_not_block_it(tmp_path):
+    path = tmp_path / "t.sqlite"
+    with closing(open_sink(str(path), Origin())) as sink, closing(sqlite3.connect(path)) as other:
+        sink.write(TrackedFrame(TRACKS[:1]))
+        other.execute("BEGIN")
+        assert other.execute("SELECT frame, x, object FROM tracks").fetchall() == [(0, 1 / 3, "")]
+        sink.write(TrackedFrame(TRACKS[1:2]))  # while that transaction goes on
+        assert other.execute("SELECT count(*) FROM tracks").fetchone() == (1,)
+        other.execute("END")
+        assert read(path) == [[each] for each in TRACKS[:2]]
+    assert read(path) == [[each] for each in TRACKS[:2]]
+    assert [file.name for file in tmp_path.iterdir()] == ["t.sqlite"]
+
+
+def test_a_database_alone_is_continued_after_the_last_frame_of_a_run_that_was_killed(tmp_path):
+    path = tmp_path / "t.sqlite"
+    log = tmp_path / "tracks.ndjson"
+    log.write_text("".join(f"{json.dumps(track.to_dict())}\n" for track in TRACKS[:2]))
+    killed = subprocess.run([sys.executable, "-P", "-c", KILLED, path, log], check=False)
+    assert killed.returncode == -signal.SIGKILL
+    run = RunFiles(Origin(), None, [str(path)])
+    run.check(overwrite=False, earlier=run.places)
+    assert run.position()[0] == 2
+    more = replace(run, places=[*run.places, str(tmp_path / "t.ndjson")])
+    with more.opened("", resume=True) as files:
+        assert read(path) == read(tmp_path / "t.ndjson") == [[each] for each in TRACKS[:2]]
+        files.write(TrackedFrame(TRACKS[2:]))
+    assert read(path) == read(tmp_path / "t.ndjson") == [[each] for each in TRACKS]
+
+
+@pytest.mark.parametrize("begun", ["", "PRAGMA journal_mode = WAL"])
+def test_a_run_that_was_killed_before_its_database_had_a_table_continues(tmp_path, begun):
+    path = tmp_path / "t.sqlite"
+    path.touch()
+    with closing(sqlite3.connect(path)) as database:
+        database.execute(begun)
+    run = RunFiles(Origin(), None, [str(path)])
+    run.check(overwrite=False, earlier=run.places)
+    assert run.position()[0] == 0
+    with run.opened("", resume=True) as files:
+        files.write(TrackedFrame(TRACKS[:1]))
+    assert read(path) == [TRACKS[:1]]
+
+
+@pytest.mark.parametrize("disk", [1 << 17], indirect=True)
+def test_a_full_disk_is_an_error_of_one_line_and_the_frames_before_it_remain(disk):
+    sink = open_sink(str(disk / "t.sqlite"), Origin())
+    sink.write(TrackedFrame(TRACKS[:1]))
+    (disk / "ballast").write_bytes(bytes((1 << 17) - sum(file.stat().st_size for file in disk.iterdir()) - 8192))
+    many = TrackedFrame([replace(TRACKS[0], frame=1, object=f"object-{number}") for number in range(999)])
+    with pytest.raises(VideoError, match=r"cannot write .*t\.sqlite.*full"):
+        sink.write(many)
+    (disk / "ballast").unlink()
+    sink.close()
+    assert read(disk / "t.sqlite") == [TRACKS[:1]]
+
+
+def test_frames_wait_in_memory_while_another_program_locks_the_database(tmp_path, caplog, monkeypatch):
+    monkeypatch.setattr(remote, "_STABLE_SECONDS", 0.0)
+    path = tmp_path / "t.sqlite"
+    with closing(open_sink(str(path), Origin())) as sink:
+        with closing(sqlite3.connect(path, isolation_level=None)) as other:
+            other.execute("BEGIN IMMEDIATE")
+            for track in TRACKS:
+                sink.write(TrackedFrame([track]))
+            assert read(path) == []
+        sink.write(TrackedFrame([replace(TRACKS[0], frame=9)]))
+        assert [frame.number for frame in Log(path)] == [0, 1, 3, 9]
+    assert [message.rpartition(": ")[2] for message in caplog.messages] == [
+        "locked by another program; frames wait in memory",
+        "recovered",
+    ]
+
+
+def test_frames_beyond_those_that_wait_are_counted_and_reported_at_the_end(tmp_path, monkeypatch):
+    monkeypatch.setattr("catstream.output.database._MOST_WAITING", 2)
+    monkeypatch.setattr("catstream.output.database._CLOSE_SECONDS", 0.0)
+    path = tmp_path / "t.sqlite"
+    sink = open_sink(str(path), Origin())
+    with closing(sqlite3.connect(path, isolation_level=None)) as other:
+        other.execute("BEGIN IMMEDIATE")
+        for track in TRACKS:
+            sink.write(TrackedFrame([track]))
+    sink.write(TrackedFrame([replace(TRACKS[0], frame=9)]))
+    with pytest.raises(VideoError, match="lacks 2 frames, as another program locked it"):
+        sink.close()
+    assert [frame.number for frame in Log(path)] == [3, 9]
+
+
+def test_a_database_has_the_head_of_the_run_and_an_export_keeps_it(tmp_path):
+    head = Head(source="walk.mp4", size=(320, 240), start=100, stride=2)
+    with closing(open_sink(str(tmp_path / "t.sqlite"), Origin(head=head))) as sink:
+        sink.write(TrackedFrame(TRACKS[:1]))
+    assert Log(tmp_path / "t.sqlite").head() == head

@@ -1,0 +1,206 @@
+"""Events, by histories: what came of tracks, in the order in which they came."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from catstream.base.box import Box
+from catstream.errors import SettingsError
+from catstream.output.events import WHEN, Events, check_zones
+from catstream.wire.messages import Health, Track
+
+#: A square of x and y from 40 to 60.
+DOOR = {"door": ((40, 40), (60, 40), (60, 60), (40, 60))}
+
+
+def tracks(history, name="", began=0, first=0):
+    """A track a second: a digit is the box whose centre is at x = ten times the digit and y = 50, "." none."""
+    for frame, x in enumerate(history, first):
+        box = None if x == "." else Box(10 * int(x) - 5, 45, 10, 10)
+        yield Track(frame, frame, "present" if box else "absent", box, 0.9, 1, object=name, began=began)
+
+
+LOST_IN_DOOR = ["0 found", "0 entered door", "3 left door", "3 lost"]
+
+
+def told(events):
+    return [f"{event.track.time:g} {event.kind} {event.zone}".strip() for event in events]
+
+
+@pytest.mark.parametrize(
+    ("history", "expected"),
+    [
+        ("", []),
+        ("...", ["2 ended"]),
+        ("..1", ["2 found", "2 ended"]),
+        ("1..1", ["0 found", "3 ended"]),  # shorter than three seconds
+        ("1...1", ["0 found", "3 lost", "4 returned", "4 ended"]),
+        ("1....", ["0 found", "3 lost", "4 ended"]),
+        ("1....1...", ["0 found", "3 lost", "5 returned", "8 lost", "8 ended"]),
+        ("1345", ["0 found", "2 entered door", "3 left door", "3 ended"]),  # it ended there
+        ("4371", ["0 found", "0 entered door", "3 left door", "3 ended"]),  # 3 and 7 are within the margin
+        ("3737", ["0 found", "3 ended"]),  # it never was in the zone
+        (
+            "5...5",
+            [
+                "0 found",
+                "0 entered door",
+                "3 left door",
+                "3 lost",
+                "4 returned",
+                "4 entered door",
+                "4 left door",
+                "4 ended",
+            ],
+        ),
+        ("5...1", ["0 found", "0 entered door", "3 left door", "3 lost", "4 returned", "4 ended"]),
+    ],
+)
+def test_a_history_of_an_object(history, expected):
+    events = Events(DOOR, WHEN | {"lost": 3.0})
+    assert told([*events.update([*tracks(history)]), *events.close()]) == expected
+
+
+def test_only_the_events_that_are_wanted_are_told():
+    events = Events(DOOR, {"lost": 1.0, "entered": 0.0})
+    assert told([*events.update([*tracks("5.1")]), *events.close()]) == ["0 entered door", "1 lost"]
+
+
+def test_a_source_is_lost_after_the_seconds_of_lost_and_objects_are_unknown_until_their_next_track():
+    events = Events(DOOR, WHEN | {"lost": 3.0})
+    events.update([*tracks("5")])
+    seconds = (0.0, 1.0, 3.0, 9.0, 0.0, 2.0, 0.0)
+    reports = [events.update_run(Health("detector", 0.0, {"lost_seconds": each})) for each in seconds]
+    assert [[(event.kind, event.facts["seconds"]) for event in each] for each in reports] == [
+        [], [], [("source_lost", 3.0)], [], [("source_back", 9.0)], [], [],
+    ]  # fmt: skip
+    assert events.status("") == {"present": None, "zones": []}
+    assert told(events.update([*tracks("5", first=1)])) == []
+    assert events.status("") == {"present": True, "zones": ["door"]}
+
+
+def test_results_and_checkpoints_that_cannot_be_written_are_an_event_each_and_so_is_their_end():
+    events = Events({})
+    reports = [
+        *(
+            Health("detector", 0, {"write_failed": failed, "not_written": 7.0}, "full", "cam")
+            for failed in (0, 1, 1, 0)
+        ),
+        Health("compressor", 0, {"write_failed": 1}, "read-only"),
+        Health("compressor", 0, {}),  # restarted: it has not tried it yet
+        *(Health("compressor", 0, {"write_failed": failed}, "read-only" * failed) for failed in (1, 0, 0)),
+    ]
+    found = [event for report in reports for event in events.update_run(report)]
+    assert [(event.kind, *event.facts.values()) for event in found] == [
+        ("write_failed", "cam", 7, "full"),
+        ("write_resumed", "cam", 7, "full"),
+        ("write_failed", "cam", 0, "read-only"),
+        ("write_resumed", "cam", 0, "read-only"),
+    ]
+
+
+def test_another_object_of_the_same_name_ends_the_one_before():
+    events = Events(DOOR)
+    assert told(events.update([*tracks("5"), *tracks("1", began=1, first=1)])) == [
+        "0 found", "0 entered door", "0 left door", "0 ended", "1 found",
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("together", [True, False])
+def test_an_object_that_was_forgotten_ends_once_the_others_have_four_frames_more(together):
+    events = Events({})
+    ben = [[track] for track in tracks("1111", "ben")]
+    anna = [[track] for track in tracks("11111111", "anna")]
+    frames = [each + more for each, more in zip(anna, ben + [[]] * 4, strict=True)]
+    found = [
+        told(events.update(each)) for frame in frames for each in ([frame] if together else [[it] for it in frame])
+    ]
+    assert [each for each in found if each][-1] == ["3 ended"]
+    assert found[-1] == ["3 ended"]
+    assert told(events.close()) == ["7 ended"]
+
+
+def test_an_object_of_which_a_subscriber_loses_messages_has_not_ended():
+    """From the rest of one frame up to the beginning of a later one."""
+    names = ("anna", "ben", "carl")
+    frames = [*zip(*(tracks("1111111", name) for name in names), strict=True)]
+    came = [*frames[0], frames[1][0], frames[4][2], *frames[5], *frames[6]]
+    events = Events({})
+    assert [event.kind for track in came for event in events.update([track])] == ["found"] * 3
+
+
+def test_an_event_has_its_track():
+    (event,) = Events({}).update([*tracks("1", "anna")])
+    fields = event.to_dict()
+    assert fields.pop("track") == event.track.to_dict()
+    assert fields == {"event": "found", "object": "anna", "time": 0.0, "zone": None}
+
+
+@given(st.text(".0123456789", max_size=60))
+def test_whatever_begins_ends(history):
+    events = Events(DOOR)
+    kinds = [event.kind for event in (*events.update([*tracks(history)]), *events.close())]
+    assert kinds.count("entered") == kinds.count("left")
+    assert kinds.count("ended") == bool(history)
+    assert kinds.count("lost") - kinds.count("returned") in (0, 1)
+    assert kinds[-1:] == ["ended"] * bool(history)
+
+
+@given(st.text(".0123456789", max_size=60))
+def test_an_object_is_in_the_zones_that_it_entered_and_in_none_while_it_is_lost(history):
+    events, inside = Events(DOOR), set()
+    for track in tracks(history):
+        for event in events.update([track]):
+            {"entered": inside.add, "left": inside.discard}.get(event.kind, lambda _: None)(event.zone)
+        status = events.status("")
+        assert set(status["zones"]) == inside
+        assert status["present"] or not inside
+
+
+FRAME = (320, 240)
+
+
+@pytest.mark.parametrize(
+    ("corners", "words"),
+    [
+        ("0.1,0.1 0.9,0.1 0.9,0.9 0.1,0.9", "not fractions"),
+        ("0,0 1,0 1,1 0,1", "not fractions"),
+        ("1,2 3,4", "at least 3 corners, got 2"),
+        ("50,50 50,50 50,50", "on a line"),
+        ("10,10 20,20 30,30", "on a line"),
+        ("10,10 200,10 200,10.001", "on a line"),
+        ("0,0 100,100 100,0 0,100", "edges cross"),
+        ("50,0 80,100 0,40 100,40 20,100", "edges cross"),
+        ("2000,900 2100,900 2100,1000", "outside the frame of 320x240"),
+        ("-90,-90 -10,-90 -10,-10", "outside the frame"),
+        ("310,-500 900,-500 900,90", "outside the frame"),  # the box around it is not outside
+        ("1e12,1e12 2e12,1e12 2e12,2e12", "outside the frame"),
+        ("1,2 3,4 5,nan", "finite"),
+        ("1,2 inf,4 5,6", "finite"),
+    ],
+)
+def test_a_zone_that_nothing_can_enter_is_an_error(corners, words):
+    points = tuple(tuple(map(float, corner.split(","))) for corner in corners.split())
+    with pytest.raises(SettingsError, match=f"zone door: .*{words}"):
+        check_zones({"door": points}, FRAME)
+
+
+@pytest.mark.parametrize("name", ["it's", "", "a b", "a/b", "a#", "{{x}}"])
+def test_a_zone_whose_name_is_not_safe_in_a_template_a_topic_or_a_file_name_is_an_error(name):
+    with pytest.raises(SettingsError, match=r"^zone: .* is not a name: expected text of 1 to 64 letters, digits"):
+        check_zones({name: ((0, 0), (90, 0), (90, 90))})
+
+
+@pytest.mark.parametrize(
+    "corners",
+    [
+        "0,0 320,0 320,240 0,240",
+        "-50,-50 400,-50 400,300 -50,300",
+        "300,200 900,200 900,900",
+        "10,10 10,10 60,10 60,60",  # a corner twice
+        "10,10 100,10 100,100 55,100 55,50 50,50 50,100 10,100",  # not convex
+        "5,5 7,5 7,7",
+    ],
+)
+def test_a_zone_that_is_partly_in_the_frame_is_valid(corners):
+    check_zones({"door": tuple(tuple(map(float, corner.split(","))) for corner in corners.split())}, FRAME)

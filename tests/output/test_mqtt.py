@@ -1,0 +1,355 @@
+"""MQTT, with a real broker: what a subscriber gets, while the broker is there, away, back, silent, or asks for more."""
+
+import gc
+import json
+import os
+import shutil
+import socket
+import subprocess
+import sys
+import threading
+import time
+from contextlib import ExitStack, closing, contextmanager, suppress
+from dataclasses import replace
+
+import paho.mqtt.client as mqtt
+import pytest
+
+from catstream.base.box import Box
+from catstream.client.address import Address
+from catstream.output import mqtt_sink, remote
+from catstream.output.destinations import Origin, SinkOptions, TrackedFrame, open_sink
+from catstream.output.track_log import RunFiles
+from catstream.wire.channels import HEALTH
+from catstream.wire.messages import Health, Track
+from catstream.wire.newest import Publisher
+
+MOSQUITTO = shutil.which("mosquitto", path=f"{os.environ['PATH']}:/usr/sbin")
+needs_broker = pytest.mark.skipif(MOSQUITTO is None, reason="no MQTT broker: apt-get install mosquitto")
+DOOR = {"door": ((0, 0), (100, 0), (100, 100), (0, 100))}
+ANNA = Track(0, 0.0, "present", Box(10, 20, 30, 40), 0.9, 1, object="anna")
+
+
+class Broker:
+    """A broker with the user me, whose password is s/1; `start` and `stop` may be called again and again."""
+
+    def __init__(self, folder, until, *, tls=False):
+        with socket.socket() as free:
+            free.bind(("127.0.0.1", 0))
+            self.port = free.getsockname()[1]
+        self._folder, self._until, self._process, self._stack = folder, until, None, ExitStack()
+        self.scheme = "mqtts" if tls else "mqtt"
+        self.url = f"{self.scheme}://me:s%2F1@localhost:{self.port}/yard/cam"
+        (folder / "passwords").write_text("me:s/1\n")
+        (folder / "passwords").chmod(0o600)
+        subprocess.run(["mosquitto_passwd", "-U", folder / "passwords"], check=True)
+        lines = [f"listener {self.port} localhost", "allow_anonymous false", f"password_file {folder / 'passwords'}"]
+        if tls:
+            self._make_certificate()
+            lines += [f"certfile {folder / 'crt'}", f"keyfile {folder / 'key'}"]
+        user = "user root" if os.getuid() == 0 else ""
+        (folder / "conf").write_text("\n".join([*lines, user, "persistence false", ""]))
+
+    def _make_certificate(self):
+        words = "req -x509 -newkey rsa:2048 -nodes -days 2 -subj /CN=localhost -addext subjectAltName=DNS:localhost"
+        subprocess.run(["openssl", *words.split(), "-keyout", "key", "-out", "crt"], cwd=self._folder, check=True,
+                       capture_output=True)  # fmt: skip
+
+    def start(self):
+        self._process = subprocess.Popen([MOSQUITTO, "-c", self._folder / "conf"], stderr=subprocess.DEVNULL)
+        self._until(self._listens)
+
+    def _listens(self):
+        with socket.socket() as probe:
+            return probe.connect_ex(("127.0.0.1", self.port)) == 0
+
+    def stop(self):
+        self._stack.pop_all().close()
+        if self._process is not None:
+            self._process.kill()
+            self._process.wait()
+
+    def subscriber(self):
+        """What a subscriber gets from now on, each topic with its payloads; what was retained comes at once."""
+        got, subscribed = {}, []
+        client = mqtt.Client(mqtt.CallbackAPIVersion.VERSION2)
+        client.username_pw_set("me", "s/1")
+        if self.scheme == "mqtts":
+            client.tls_set(self._folder / "crt")
+        client.on_message = lambda _, __, it: got.setdefault(it.topic, []).append(it.payload.decode())
+        client.on_subscribe = lambda *_: subscribed.append(True)
+        client.connect("localhost", self.port)
+        client.loop_start()
+        self._stack.callback(client.loop_stop)
+        self._stack.callback(client.disconnect)
+        client.subscribe("#", 1)
+        self._until(lambda: subscribed)
+        return got
+
+
+@pytest.fixture
+def broker(tmp_path, until):
+    found = Broker(tmp_path, until)
+    yield found
+    found.stop()
+
+
+def quick(monkeypatch):
+    """Do not wait at the end for a broker that stays away."""
+    monkeypatch.setattr(mqtt_sink, "CLOSE_SECONDS", 0.1)
+
+
+def opened(url, **options):
+    return closing(open_sink(url, Origin(options=SinkOptions(**options))))
+
+
+def online(sink, until):
+    """Write a track once there is a connection, and wait until all has arrived."""
+    until(lambda: sink._client.is_connected() and not sink._is_away)
+    sink.write(TrackedFrame([ANNA]))
+    until(lambda: sink._acknowledged == sink._published)
+
+
+def events(got):
+    return [(each["event"], each["time"]) for each in map(json.loads, got.get("yard/cam/events", []))]
+
+
+def last(got, topic):
+    """The newest payload of a topic, or None where it has not arrived yet."""
+    return got.get(topic, [None])[-1]
+
+
+def lost(time):
+    return TrackedFrame([replace(ANNA, frame=time, time=float(time), state="absent", box=None)])
+
+
+@needs_broker
+def test_a_subscriber_gets_events_states_and_availability(broker, until):
+    broker.start()
+    got = broker.subscriber()
+    with opened(broker.url, zone=DOOR, rate=1e-3) as sink:
+        online(sink, until)
+        late = broker.subscriber()  # who gets what is retained
+        until(lambda: len(late) == 5)
+        sink.write(lost(9))
+    assert sink.missed == 0
+    until(lambda: last(got, "yard/cam/availability") == "offline")
+    assert got["yard/cam/availability"] == ["online", "offline"]
+    assert events(got) == [("found", 0.0), ("entered", 0.0), ("left", 9.0), ("lost", 9.0), ("ended", 9.0)]
+    *states, removed = got["yard/cam/objects/anna"]  # only at the changes, with this rate
+    assert removed == ""
+    assert [(state["present"], state["zones"], state["frame"]) for state in map(json.loads, states)] == [
+        (True, ["door"], 0), (False, [], 9),
+    ]  # fmt: skip
+    assert json.loads(late["yard/cam/objects/anna"][0]) == json.loads(states[0])
+    configs = [json.loads(each[0]) for topic, each in late.items() if topic.startswith("homeassistant/")]
+    assert {config["name"] for config in configs} == {"anna", "anna in door"}
+    for config in configs:
+        assert config["state_topic"] in late
+        assert {each["topic"] for each in config["availability"]} == {"yard/cam/availability", "yard/cam/source"}
+
+
+@needs_broker
+def test_a_lost_source_is_an_event_and_its_objects_are_unknown(broker, until, endpoint):
+    broker.start()
+    got = broker.subscriber()
+    with Publisher(HEALTH, endpoint, "detector") as health:
+        origin = Origin(address=Address(str(endpoint)), options=SinkOptions(zone=DOOR, rate=1e-3))
+        with closing(open_sink(broker.url, origin)) as sink:
+            online(sink, until)
+
+            def report(seconds, state):
+                def turn():
+                    for counters in ({"lost_seconds": seconds}, {}):  # a restarted detector does not know it yet
+                        health.send(Health("detector", 0.0, counters, source="rtsp://cam"))
+                    sink.idle()
+
+                until(lambda: last(got, "yard/cam/source") == state, turn)
+
+            report(7.0, "lost")
+            report(0.0, "online")
+            online(sink, until)
+    until(lambda: last(got, "yard/cam/availability") == "offline")
+    assert got["yard/cam/source"] == ["online", "lost", "online"]
+    about = [each for each in map(json.loads, got["yard/cam/events"]) if each["track"] is None]
+    assert [(each["event"], each["source"], each["seconds"]) for each in about] == [
+        ("source_lost", "rtsp://cam", 7.0), ("source_back", "rtsp://cam", 7.0),
+    ]  # fmt: skip
+    states = [json.loads(each) for each in got["yard/cam/objects/anna"] if each]
+    assert [(state["present"], state["zones"]) for state in states] == [(True, ["door"]), (None, []), (True, ["door"])]
+    jinja2 = pytest.importorskip("jinja2")  # the templates of Home Assistant
+    configs = [json.loads(each[0]) for topic, each in got.items() if topic.startswith("homeassistant/")]
+    for config in configs:
+        template = jinja2.Template(config["value_template"])
+        assert [template.render(value_json=state) for state in states] == ["ON", "None", "ON"]
+        assert template.render(value_json={"present": False, "zones": []}) == template.render() == "OFF"
+
+
+@needs_broker
+def test_the_last_events_are_sent_before_a_slow_delivery(broker, until, tmp_path):
+    broker.start()
+    got = broker.subscriber()
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        places = [broker.url, f"http://127.0.0.1:{silent.getsockname()[1]}/hook", f"{tmp_path / 'events'}/"]
+        files = RunFiles(Origin(), None, places)
+        with files.opened(str(tmp_path)) as outputs:
+            outputs.write(TrackedFrame([ANNA]))
+            outputs.end()
+            until(lambda: got.get("yard/cam/availability") == ["online", "offline"])
+            assert '"ended"' in (tmp_path / "events" / "events.ndjson").read_text()
+            began = time.monotonic()
+    assert events(got)[-1] == ("ended", 0.0)
+    assert time.monotonic() - began < 2 * remote.CLOSE_SECONDS, "destinations share the time"
+
+
+@needs_broker
+def test_the_sensors_of_an_object_that_was_forgotten_are_removed(broker, until):
+    broker.start()
+    got = broker.subscriber()
+    with opened(broker.url, when={"lost": 2.0}) as sink:
+        online(sink, until)
+        for frame in range(1, 5):
+            sink.write(TrackedFrame([replace(ANNA, frame=frame, object="ben")]))
+        until(lambda: got.get("yard/cam/objects/anna", [None])[-1] == "")
+        empty = [topic for topic, each in got.items() if each[-1] == "" and topic.startswith("homeassistant/")]
+        assert [json.loads(got[topic][0])["name"] for topic in empty] == ["anna"]
+
+
+@needs_broker
+def test_a_process_that_is_killed_is_offline_by_its_last_will(broker, until):
+    broker.start()
+    got = broker.subscriber()
+    killed = (
+        "import os, sys, time; from catstream.output.destinations import *; from catstream.wire.messages import *\n"
+        "sink = open_sink(sys.argv[1], Origin())\n"
+        "while sink._acknowledged < 5:\n"
+        "    sink.write(TrackedFrame([Track(0, 0.0, 'absent', None, 0.0, 0)])); time.sleep(0.01)\n"
+        "os.kill(os.getpid(), 9)"
+    )
+    subprocess.run([sys.executable, "-P", "-c", killed, broker.url], check=False)
+    until(lambda: got.get("yard/cam/availability") == ["online", "offline"])
+    assert "yard/cam/objects/-" in got
+
+
+@needs_broker
+def test_a_broker_that_is_away_gets_the_events_when_it_is_back_and_misses_states(broker, until, caplog):
+    with opened(broker.url, rate=1e6) as sink:
+        sink.write(TrackedFrame([ANNA]))
+        until(lambda: "no connection (Connection refused)" in caplog.text)
+        sink.write(TrackedFrame([ANNA]))
+        broker.start()
+        got = broker.subscriber()
+        online(sink, until)
+        until(lambda: events(got) == [("found", 0.0)])
+        assert sink.missed > 0
+        until(lambda: sink._acknowledged == sink._published)
+        broker.stop()  # it forgets what was retained
+        until(lambda: "the connection was lost" in caplog.text)
+        sink.write(lost(9))
+        broker.start()
+        got = broker.subscriber()
+        online(sink, until)
+    until(lambda: events(got)[-1:] == [("ended", 0.0)])
+    assert ("lost", 9.0) in events(got)
+    assert got["yard/cam/availability"] == ["online", "offline"]
+    assert any(topic.startswith("homeassistant/") for topic in got)
+    assert f"the broker has not received {sink.missed} message" in caplog.text
+    assert "s/1" not in caplog.text
+    assert "s%2F1" not in caplog.text
+
+
+def test_a_broker_that_never_answers_holds_nothing_up_and_what_it_misses_is_counted(monkeypatch, caplog):
+    monkeypatch.setattr(mqtt_sink, "QUEUED", 5)
+    quick(monkeypatch)
+    with (
+        socket.create_server(("127.0.0.1", 0)) as silent,
+        opened(f"mqtt://127.0.0.1:{silent.getsockname()[1]}/yard", rate=1e-3) as sink,
+    ):
+        sink.write(TrackedFrame([ANNA]))
+        for time in range(1, 21):
+            sink.write(lost(10 * time))
+            sink.write(TrackedFrame([replace(ANNA, frame=10 * time + 1, time=10.0 * time + 1)]))
+    # 42 events: found, 20 lost, 20 returned, ended; a state after all but the last; online and offline, the state of
+    # the source, sensor, removal
+    assert sink.missed == 42 + 41 + 5
+    assert "the broker has not received 88 messages" in caplog.text
+
+
+@contextmanager
+def answering(reply):
+    """A server that answers each connection with some bytes, and closes it; yields its port, and the connections."""
+    connections = []
+    with socket.create_server(("127.0.0.1", 0)) as server, suppress(OSError):
+
+        def serve():
+            with suppress(OSError):
+                while True:
+                    connection, _ = server.accept()
+                    connections.append(connection)
+                    with connection:
+                        connection.recv(1024)  # all: a reply before a reset would be lost
+                        connection.sendall(reply)
+
+        threading.Thread(target=serve, daemon=True).start()
+        yield server.getsockname()[1], connections
+        server.shutdown(socket.SHUT_RDWR)
+
+
+CLOSED, HTTP, SSH = b"", b"HTTP/1.1 400 Bad Request\r\n\r\n", b"SSH-2.0-OpenSSH_9.2\r\n"
+REFUSED = b"\x20\x02\x00\x05"  # an acknowledgement of MQTT 3.1.1: not authorized
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # paho does not close its sockets
+@pytest.mark.parametrize(
+    ("scheme", "reply", "problem"),
+    [
+        ("mqtt", CLOSED, "no MQTT reply: not an MQTT broker, another port, or mqtts:// with TLS"),
+        ("mqtt", HTTP, "no MQTT reply: not an MQTT broker"),
+        ("mqtt", SSH, "no MQTT reply: not an MQTT broker"),
+        ("mqtts", HTTP, "TLS handshake failed, the port may be one without TLS"),
+        ("mqtt", REFUSED, "the broker refuses the connection (Not authorized)"),
+    ],
+)
+def test_a_server_that_is_no_broker_or_refuses_is_told_once_with_its_cause(
+    scheme, reply, problem, until, caplog, monkeypatch
+):
+    quick(monkeypatch)
+    monkeypatch.setattr(mqtt_sink, "_LONGEST_PAUSE", 1)
+    with answering(reply) as (port, connections):
+        with opened(f"{scheme}://127.0.0.1:{port}/yard") as sink:
+            until(lambda: len(connections) >= 3)
+            sink.write(TrackedFrame([ANNA]))
+        lines = [record.getMessage() for record in caplog.records]
+    assert [line for line in lines if "has not received" not in line] == [lines[0]]
+    assert problem in lines[0]
+
+
+def test_a_server_that_never_replies_is_told(caplog, monkeypatch, until):
+    quick(monkeypatch)
+    monkeypatch.setattr(mqtt_sink, "_REPLY_SECONDS", 0)
+    with (
+        socket.create_server(("127.0.0.1", 0)) as silent,
+        opened(f"mqtt://127.0.0.1:{silent.getsockname()[1]}/yard") as sink,
+    ):
+        until(lambda: "it may not be an MQTT broker" in caplog.text, lambda: sink.write(TrackedFrame([ANNA])))
+
+
+@needs_broker
+@pytest.mark.skipif(shutil.which("openssl") is None, reason="no certificate without it: apt-get install openssl")
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # paho does not close it
+def test_tls_needs_a_certificate_that_this_machine_trusts(tmp_path, until, monkeypatch, caplog):
+    broker = Broker(tmp_path, until, tls=True)
+    broker.start()
+    try:
+        with monkeypatch.context() as patch, opened(broker.url):
+            until(lambda: "certificate verify failed" in caplog.text)
+            quick(patch)
+        until(lambda: not any(thread.name.startswith("paho") for thread in threading.enumerate()))
+        gc.collect()
+        got = broker.subscriber()
+        monkeypatch.setenv("SSL_CERT_FILE", str(tmp_path / "crt"))
+        with opened(broker.url) as sink:
+            online(sink, until)
+        until(lambda: events(got)[-1:] == [("ended", 0.0)])
+    finally:
+        broker.stop()

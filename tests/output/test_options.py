@@ -1,0 +1,84 @@
+"""The table of options: a value that is invalid or has no effect is an error before the run."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from catstream.errors import SettingsError
+from catstream.output.destinations import SINKS, SinkOptions
+from catstream.output.options import OPTIONS, parse
+
+DOOR, TRIANGLE = {"door": "10,10 90,10 90,90"}, ((10.0, 10.0), (90.0, 10.0), (90.0, 90.0))
+YARD, HOOK = "mqtt://127.0.0.1:9/yard", "http://127.0.0.1:9/hook"
+
+
+def test_every_option_is_a_field_and_affects_destinations_that_exist():
+    assert OPTIONS.keys() == {*SinkOptions.__dataclass_fields__}
+    for option in OPTIONS.values():
+        assert {*option.users} <= SINKS.keys()
+
+
+def test_values_of_a_file_and_of_the_command_line_give_the_same_options():
+    given = {"zone": DOOR, "when": "lost=10,entered", "picture": True, "secret_file": "key"}
+    expected = SinkOptions({"door": TRIANGLE}, {"lost": 10.0, "entered": 0.0}, 5.0, True, Path("key"), 0.5)
+    places = [YARD, HOOK, "events/"]
+    assert parse(given | {"rate": 5.0, "megabytes": 0.5}, places) == expected
+    assert parse(given | {"rate": "5", "megabytes": "0.5"}, places) == expected
+    assert parse({}, ["t.csv"]) == SinkOptions()
+
+
+@pytest.mark.parametrize(
+    ("values", "error"),
+    [
+        ({"zone": {"door": "1,2 3,four 5,6"}}, "zone: expected the corners of door as X,Y X,Y X,Y ..., got"),
+        ({"zone": {"door": ""}}, "zone: zone door: a polygon has at least 3 corners, got 0"),
+        ({"zone": {"it's": "1,2 9,4 5,9"}}, "zone: zone: .* is not a name"),
+        ({"rotate": "1 week"}, "rotate: expected a time or a size, as 12h, 1d, 500MB or 2GB, got '1 week'"),
+        ({"when": "gone"}, "when: expected some of found, lost, returned"),
+        ({"when": "found=3"}, "when: expected some of found, lost, returned"),
+        ({"when": ""}, "when: expected some of found, lost, returned"),
+        ({"when": "lost=soon"}, "when: expected 0 to 86400 seconds, as in lost=10, got 'lost=soon'"),
+        ({"when": "lost=inf"}, "when: expected 0 to 86400 seconds"),
+        ({"when": "lost=nan"}, "when: expected 0 to 86400 seconds"),
+        ({"rate": "0"}, "rate: must be a number above 0 and at most 1000, got '0'"),
+        ({"rate": "nan"}, "rate: must be a number above 0"),
+        ({"megabytes": "none"}, "megabytes: must be a number above 0"),
+        ({"when": "entered"}, "when entered has no effect without a zone: add zone"),
+        ({"when": "lost,left"}, "when left has no effect without a zone"),
+    ],
+)
+def test_an_invalid_value_is_an_error(values, error):
+    with pytest.raises(SettingsError, match=f"^{error}"):
+        parse(values, [YARD, HOOK, "events/", "t.csv"])
+
+
+@pytest.mark.parametrize(
+    ("place", "values", "error"),
+    [
+        ("t.csv", {"when": "lost=10"}, "when has no effect on these destinations: omit it, or add mqtt://"),
+        ("t.csv", {"picture": True}, "picture has no effect on these destinations: omit it"),
+        ("events/", {"picture": True}, r"picture has no effect .* \(a folder always has pictures\): omit it"),
+        ("t.csv", {"zone": DOOR}, "zone has no effect on these destinations"),
+        (HOOK, {"rate": "5"}, "rate has no effect on these destinations: omit it, or add mqtt:// or mqtts://"),
+        (YARD, {"secret_file": "key"}, "secret_file has no effect .* http:// or https://"),
+        (HOOK, {"megabytes": "5"}, "megabytes has no effect on these destinations: omit it, or add /"),
+        (HOOK, {"zone": DOOR, "when": "lost"}, "zone has no effect: add entered or left to when"),
+    ],
+)
+def test_an_option_without_effect_is_an_error(place, values, error):
+    with pytest.raises(SettingsError, match=error):
+        parse(values, [place])
+
+
+@pytest.mark.parametrize(
+    ("words", "error"),
+    [
+        (["--zone", "1,2 3,4 5,6"], "expected NAME=TEXT, each with a new name"),
+        (["--zone", "a=1,2 9,4 5,9", "--zone", "a=1,2 9,4 5,9"], "expected NAME=TEXT, each with a new name"),
+        (["--rate", "5"], "--rate has no effect on these destinations: omit it, or add mqtt:// or mqtts://"),
+        (["--secret-file", "none"], "cannot read the key none: No such file or directory"),
+    ],
+)
+def test_the_command_line_names_its_option_in_the_error(fail, words, error):
+    assert re.search(error, fail("sink", HOOK, *words))

@@ -1,0 +1,488 @@
+"""The log of a run: NDJSON and CSV hold every track at once, and are continued where a crash has cut them."""
+
+import csv
+import errno
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from contextlib import ExitStack, closing
+from dataclasses import replace
+from functools import partial
+from itertools import count, product
+from math import inf
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from catstream.base.box import Box
+from catstream.base.files import REMEDIES
+from catstream.errors import VideoError
+from catstream.output import remote, track_log
+from catstream.output.destinations import Head, Origin, Rotation, SinkOptions, TrackedFrame, open_sink
+from catstream.output.track_log import JoinedLog, Log, RunFiles, places_of
+from catstream.processes.job import Results
+from catstream.video.rendered import write
+from catstream.video.source import open_source
+from catstream.wire.messages import Track
+
+BOX = Box(10.0, 20.0, 30.5, 40.0)
+TRACKS = [
+    Track(0, 0.0, "bootstrapping", BOX, 1.0, 0, checked="keyframe", probability=1.0),
+    Track(1, 0.04, "absent", None, 0.125, 3, checked="checked", probability=0.975),
+    Track(3, 0.12, "present", Box(-2.0, 21.0, 30.0, 40.0), 0.75, 4, 17.5),
+]
+
+
+def track(frame, name=""):
+    box = Box(10.0 + frame, 20.0, 30.0, 40.0) if frame % 4 else None
+    return Track(frame, frame / 30, "present" if box else "absent", box, 0.5, frame // 3, object=name)
+
+
+def filled(path, stack):
+    """A file that holds the tracks, as it is before it is closed."""
+    sink = open_sink(str(path), Origin())
+    stack.callback(sink.close)
+    for each in TRACKS:
+        sink.write(TrackedFrame([each], 0.25 * each.frame))
+    return path
+
+
+def test_each_track_is_in_the_files_at_once(tmp_path):
+    with ExitStack() as stack:
+        objects = [json.loads(line) for line in filled(tmp_path / "t.ndjson", stack).read_text().splitlines()[1:]]
+        rows = list(csv.DictReader(filled(tmp_path / "t.csv", stack).read_text().splitlines()))
+    assert objects == [each.to_dict() for each in TRACKS]
+    assert list(rows[0].values()) == ["0", "0.000000", "bootstrapping", "10.0000", "20.0000", "30.5000", "40.0000",
+                                      "1.000000", "0", "", "0", "keyframe", "1.000000", "0.000000"]  # fmt: skip
+    assert [row["state"] for row in rows] == [each.state for each in TRACKS]
+    assert [row["processing"] for row in rows] == ["0.000000", "0.250000", "0.750000"]
+    assert (rows[1]["x"], rows[1]["h"]) == ("", "")
+
+
+@pytest.mark.parametrize("suffix", [".ndjson", ".csv"])
+def test_an_open_file_is_read_back_up_to_a_line_that_a_power_cut_tore(tmp_path, suffix):
+    with ExitStack() as stack:
+        path = filled(tmp_path / f"t{suffix}", stack)
+        kept = [replace(each, pts=None) for each in TRACKS] if suffix == ".csv" else TRACKS
+        whole = path.read_bytes()
+        for torn in (b"", whole.splitlines()[-1][:9] + bytes(7), bytes(4096), b"\n"):
+            path.write_bytes(whole + torn)
+            found = list(Log(path))
+            assert [frame.tracks for frame in found] == [[track] for track in kept]
+    assert list(Log(tmp_path / f"none{suffix}")) == []
+
+
+@pytest.mark.parametrize("name", ["t.ndjson", "t.csv"])
+def test_a_full_disk_is_reported_in_one_line_and_written_rows_are_kept(tmp_path, full, name):
+    sink = open_sink(str(tmp_path / name), Origin())
+    sink.write(TrackedFrame(TRACKS[:1]))
+    full(tmp_path / name)
+    with pytest.raises(VideoError, match=rf"cannot write '.*/{name}' \(No space left on device\)"):
+        sink.write(TrackedFrame(TRACKS[1:2]))
+    sink.close()
+    assert len(list(Log(tmp_path / name))) == 1
+
+
+@pytest.mark.parametrize("disk", [1 << 20], indirect=True)
+@pytest.mark.parametrize("source", ["rtsp://cam", "walk.mp4"])
+@pytest.mark.parametrize("names", [["t.ndjson"], ["t.csv"], ["t.sqlite"], ["t.ndjson", "t.csv"]], ids=" ".join)
+def test_a_full_disk_costs_a_live_source_rows_until_there_is_room_and_ends_a_file(
+    disk, fill, names, source, caplog, monkeypatch
+):
+    run = RunFiles(Origin(Head(source=source)), None, [str(disk / name) for name in names])
+    frames = iter([TrackedFrame([track(number, "anna"), track(number, "ben")]) for number in range(10_000)])
+    with run.opened("run") as outputs, ExitStack() as stack:
+        for _ in range(20):
+            outputs.write(next(frames))
+        ballast = fill()
+        if source == "walk.mp4":
+            stack.enter_context(
+                pytest.raises(VideoError, match=r"cannot write .*(No space left on device|disk is full)")
+            )
+        while outputs.missed < 50:
+            outputs.write(next(frames))
+        assert "free space on the disk" in outputs.trouble
+        ballast.unlink()
+        for _ in range(20):
+            outputs.write(next(frames))
+        assert outputs.trouble, "it holds for some seconds"
+        monkeypatch.setattr(remote, "_STABLE_SECONDS", 0)
+        outputs.write(next(frames))
+        assert not outputs.trouble
+    for log in (Log(disk / name) for name in names):
+        numbers = [frame.number for frame in log if len(frame.tracks) == 2]
+        lacking = numbers[-1] + 1 - len(numbers)
+        assert numbers == sorted(numbers)
+        assert (lacking > 0) == (source == "rtsp://cam")
+        assert log.gap == (lacking if log.path.suffix == ".ndjson" else 0)
+        if source == "rtsp://cam":
+            assert numbers[-20:] == [*range(numbers[-1] - 19, numbers[-1] + 1)]
+            assert caplog.text.count(f"{log.path.name}' (No space") <= 1, "it is said once"
+
+
+@pytest.mark.parametrize("disk", [1 << 20], indirect=True)
+@pytest.mark.parametrize(("state", "remedy"), [("full", "free space on the disk"), ("read-only", "mount it writable")])
+@pytest.mark.parametrize("name", ["t.ndjson", "t.csv", "t.sqlite"])
+def test_a_live_run_begins_on_a_full_or_read_only_disk_and_is_written_once_that_is_possible(
+    disk, fill, remount, name, state, remedy, caplog
+):
+    log = Log(disk / "out" / name)
+    live, file = (
+        RunFiles(Origin(Head(source=source)), disk / "out", [str(log.path)]) for source in ("rtsp://cam", "walk.mp4")
+    )
+    ballast = fill() if state == "full" else remount("ro")
+    live.check(overwrite=False, earlier=[])
+    with pytest.raises(VideoError, match=remedy):
+        file.opened("run")
+    with live.opened("run") as outputs:
+        for number in range(12):
+            if number == 9 and state == "full":
+                ballast.unlink()
+            elif number == 9:
+                remount("rw")
+            outputs.write(TrackedFrame([track(number)]))
+    assert [frame.number for frame in log] == [9, 10, 11]
+    assert outputs.missed == 9
+    assert log.gap == (9 if name == "t.ndjson" else 0)
+    (message,) = caplog.messages
+    assert str(log.path) in message
+    assert remedy in message
+
+
+@pytest.mark.parametrize("code", [errno.EIO, errno.EDQUOT, errno.EROFS, errno.EACCES])
+def test_an_error_of_the_disk_is_said_once_with_path_reason_and_remedy_and_costs_the_rows_meanwhile(
+    tmp_path, code, monkeypatch, caplog
+):
+    def fail(*_):
+        raise OSError(code, os.strerror(code))
+
+    log = Log(tmp_path / "t.ndjson")
+    with RunFiles(Origin(Head(source="rtsp://cam")), None, [str(log.path)]).opened("run") as outputs:
+        for number in range(9):
+            with monkeypatch.context() as disk:
+                if 3 <= number < 6:
+                    disk.setattr(os, "write", fail)
+                outputs.write(TrackedFrame([track(number)]))
+    assert [frame.number for frame in log] == [0, 1, 2, 6, 7, 8]
+    assert log.gap == outputs.missed == 3
+    (message,) = caplog.messages
+    assert f"cannot write '{log.path}' ({os.strerror(code)}): {REMEDIES.get(code, 'use another folder')}" in message
+
+
+def test_a_log_that_cannot_be_renamed_grows_and_that_is_said_once(tmp_path, monkeypatch, caplog):
+    path = tmp_path / "t.ndjson"
+    origin = Origin(Head(source="rtsp://cam"), options=SinkOptions(rotate=Rotation(inf, 1000)))
+    with RunFiles(origin, None, [str(path)]).opened("run") as outputs, monkeypatch.context() as folder:
+        folder.setattr(Path, "rename", partial(os.rename, path.parent / "none"))
+        for number in range(50):
+            outputs.write(TrackedFrame([track(number)]))
+    assert [frame.number for frame in Log(path)] == [*range(50)]
+    (message,) = caplog.messages
+    assert message.endswith("use another folder")
+
+
+@pytest.mark.parametrize("source", ["rtsp://cam", "walk.mp4"])
+def test_the_logs_of_a_live_source_rotate_together_and_are_read_as_one(tmp_path, source, monkeypatch, caplog):
+    clock = count(1_800_000_000)
+    monkeypatch.setattr(track_log, "time", SimpleNamespace(time=lambda: next(clock)))
+    options = SinkOptions(rotate=Rotation(inf, 1000), keep=5)
+    run = RunFiles(
+        Origin(Head(source=source), options=options), None, [str(tmp_path / "t.ndjson"), str(tmp_path / "t.csv")]
+    )
+    (tmp_path / "t-other.csv").touch()
+    most = 0
+    with run.opened("run") as outputs:
+        for number in range(50):
+            outputs.write(TrackedFrame([track(number)]))
+            renamed = len([*tmp_path.glob("t-2*.csv")])
+            assert renamed >= most, "none is removed below the limit"
+            most = renamed
+    files = {suffix: sorted(tmp_path.glob(f"t*{suffix}")) for suffix in (".ndjson", ".csv")}
+    files[".csv"].remove(tmp_path / "t-other.csv")
+    assert [file.stem for file in files[".csv"]] == [file.stem for file in files[".ndjson"]]
+    assert len(files[".csv"]) == (6 if source == "rtsp://cam" else 1)
+    for paths in files.values():
+        assert paths[-1].stem == "t"
+        joined = JoinedLog(Log(path) for path in reversed(paths))
+        numbers = [frame.number for frame in joined]
+        assert numbers == [*range(numbers[0], 50)]
+        assert (numbers[0] > 0) == (source == "rtsp://cam")
+    assert not caplog.text
+    with run.opened("run", resume=True) as outputs:
+        outputs.write(TrackedFrame([track(50)]))
+    assert {[*Log(paths[-1])][-1].number for paths in files.values()} == {50}
+    with pytest.raises(VideoError, match=r"has frame \d+ again: pass the files of one run"):
+        list(JoinedLog([Log(tmp_path / "t.csv"), Log(tmp_path / "t.csv")]))
+
+
+def test_a_log_rotates_in_a_new_period_in_utc(tmp_path):
+    daily = SinkOptions(rotate=Rotation(86400, inf))
+    with closing(open_sink(str(tmp_path / "t.csv"), Origin(options=daily))) as sink:
+        sink.write(TrackedFrame(TRACKS[:1]))
+        midnight = (tmp_path / "t.csv").stat().st_mtime // 86400 * 86400 + 86400
+        assert [sink.must_rotate(now) for now in (midnight - 1, midnight)] == [False, True]
+
+
+@pytest.mark.parametrize("disk", [4096], indirect=True)
+def test_a_new_file_whose_first_line_the_disk_does_not_take_is_not_left(disk):
+    (disk / "ballast").write_bytes(bytes(4096))
+    with pytest.raises(VideoError, match="No space left on device"):
+        open_sink(str(disk / "t.csv"), Origin())
+    assert [file.name for file in disk.iterdir()] == ["ballast"]
+
+
+def run_in(folder, *more):
+    """The files of a run in a folder."""
+    output = folder / "out"
+    places = [*places_of("walk", Results(output, False)), *(str(folder / name) for name in more)]
+    return RunFiles(Origin(), output, places)
+
+
+def add(run, history, first=0, resume=False):
+    """Write the frames of a run from the first one on; a history has the names of the objects in each frame."""
+    with run.opened("", resume=resume) as files:
+        for number, names in enumerate(history):
+            if number >= first:
+                files.write(TrackedFrame([track(number, name) for name in names], 0.01))
+
+
+def rows_of(run):
+    """The rows of all logs, without the processing times, which a log that was cut may lack."""
+    return {Path(place).name: [line.rpartition("," if place.endswith("csv") else "}")[0]
+            for line in Path(place).read_text().splitlines()] for place in run.places if place[-1] != "4"}  # fmt: skip
+
+
+#: The objects of each frame: a few come, go and come again.
+ALIVE = st.lists(st.sampled_from(["", "anna", "ben", "carl"]), min_size=1, unique=True)
+HISTORIES = st.lists(ALIVE, min_size=2, max_size=5)
+
+
+@settings(max_examples=120)
+@given(HISTORIES, st.data())
+def test_wherever_a_crash_cuts_the_files_no_row_is_lost_or_doubled(history, data):
+    with tempfile.TemporaryDirectory() as place:
+        whole, broken = run_in(Path(place) / "whole", "../t.csv"), run_in(Path(place) / "broken")
+        add(whole, history)
+        add(broken, history)
+        for log in broken.places:
+            size = Path(log).stat().st_size
+            os.truncate(log, size - data.draw(st.integers(0, size)))
+        again = replace(broken, places=[*broken.places, str(Path(place) / "t.csv")])  # a file that is new
+        add(again, history, broken.position()[0], resume=True)
+        assert rows_of(again) == rows_of(whole)
+
+
+def test_existing_files_are_replaced_on_request_and_continued_by_their_own_run_only(tmp_path):
+    run = run_in(tmp_path, "t.csv")
+    add(run, [[""]] * 2)
+    with pytest.raises(VideoError, match=r"walk\.ndjson exists already: replace it with --overwrite"):
+        run.check(overwrite=False, earlier=[])
+    run.check(overwrite=True, earlier=[])
+    run.check(overwrite=False, earlier=run.places)
+    with pytest.raises(VideoError, match=r"t\.csv exists already"):
+        run.check(overwrite=False, earlier=run.places[:2])
+    video = RunFiles(Origin(), None, [str(tmp_path / "t.mp4")])  # which is not a log
+    (tmp_path / "t.mp4").touch()
+    with pytest.raises(VideoError, match=r"t\.mp4 cannot be continued: pass other destinations to resume"):
+        video.check(overwrite=False, earlier=video.places)
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("t.xls", r"one of .ndjson, -, .csv, .*where - is"),
+        ("t.txt", "for other formats use catstream export"),
+        ("ftp://host/t.csv", "ftp://host/t.csv is not a destination of tracks"),
+        ("none/t.csv", "an existing folder that you may write to"),
+    ],
+)
+def test_destinations_that_cannot_be_written_are_rejected_before_the_run(tmp_path, name, words):
+    place = name if "://" in name else str(tmp_path / name)
+    with pytest.raises(VideoError, match=words):
+        RunFiles(Origin(), None, [place]).check(overwrite=False, earlier=[])
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_source_is_not_replaced_and_a_live_one_gives_no_video(tmp_path):
+    source, _ = write(tmp_path, 4, (320, 240))
+    with pytest.raises(VideoError, match=r"demo\.mp4 is the source, which would be lost"):
+        RunFiles(Origin(Head(source=str(source))), None, [str(source)]).check(overwrite=True, earlier=[])
+    live = RunFiles(Origin(Head(source="rtsp://127.0.0.1/cam")), None, [str(tmp_path / "t.mp4")])
+    with pytest.raises(VideoError, match=r"but rtsp://127.0.0.1/cam is live"):
+        live.check(overwrite=False, earlier=[])
+
+
+def test_a_video_has_the_frames_of_its_tracks(demo_video, tmp_path):
+    source, _ = demo_video(8)
+    head = Head(source=str(source), start=1, stride=2)  # frames 1, 3, 5, 7, counted 0 to 3
+    sink = open_sink(str(tmp_path / "walk.mp4"), Origin(head))
+    for each in TRACKS:
+        sink.write(TrackedFrame([each]))
+    with pytest.raises(VideoError, match="has no frame 4"):
+        sink.write(TrackedFrame([track(4)]))
+    sink.close()
+    with open_source(str(tmp_path / "walk.mp4")) as frames:
+        assert sum(1 for _ in frames) == len(TRACKS)
+
+
+@pytest.mark.parametrize("name", ["t.ndjson", "t.csv"])
+@pytest.mark.parametrize("damage", [b"?\n", b"\0\0\0\n", b"null\n", b'{"frame": "7"}\n', b"7,0.2\n"])
+def test_a_damaged_line_before_the_end_is_an_error_with_its_number_or_skipped(tmp_path, name, damage):
+    log = tmp_path / name
+    add(RunFiles(Origin(), None, [str(log)]), [[""]] * 9)
+    lines = log.read_bytes().splitlines(keepends=True)
+    log.write_bytes(b"".join([*lines[:5], damage, *lines[5:]]))
+    for read in (lambda: list(Log(log)), RunFiles(Origin(), None, [str(log)]).position):
+        with pytest.raises(VideoError, match=rf"{name}, line 6 is no track .*--skip-damaged"):
+            read()
+    skipping = Log(log, skip_damaged=True)
+    assert [frame.number for frame in skipping] == list(range(9))
+    assert skipping.damaged == 1
+    assert RunFiles(Origin(), None, [str(log)]).position(skip_damaged=True)[0] == 9
+
+
+COLUMNS = [
+    "frame",
+    "seconds",
+    "state",
+    "x",
+    "y",
+    "w",
+    "h",
+    "score",
+    "model_version",
+    "object",
+    "source_frame",
+    "processing",
+]
+
+
+def table(path, columns, separator=",", change=lambda rows: rows, encoding="utf-8", ending="\n"):
+    """A CSV log of two objects that a table program has written."""
+    rows = [
+        dict(zip(COLUMNS, [frame, frame / 25, "present", x, 20, 30, 40, 0.9, 1, name, 2 * frame, ""], strict=True))
+        for frame in range(5)
+        for x, name in ((10 + frame, "anna"), (200, "ben"))
+    ]
+    lines = [columns, *([str(row.get(column, "?")) for column in columns] for row in change(rows))]
+    path.write_bytes(ending.join(map(separator.join, lines)).encode(encoding))
+    return path
+
+
+@pytest.mark.parametrize(
+    "form",
+    [
+        {"columns": COLUMNS[::-1]},
+        {"columns": ["", *COLUMNS[:-1], "note"]},
+        {"columns": COLUMNS, "separator": ";", "encoding": "utf-8-sig", "ending": "\r\n;;;;;;;;;;;;\r\n"},
+        {"columns": COLUMNS, "change": lambda rows: sorted(rows, key=lambda row: row["object"])},
+        {"columns": COLUMNS, "change": lambda rows: rows[::-1]},
+    ],
+)  # fmt: skip
+def test_a_csv_file_is_read_by_the_names_of_its_columns_in_any_order_of_rows(tmp_path, form):
+    frames = list(Log(table(tmp_path / "t.csv", **form)))
+    assert [frame.number for frame in frames] == list(range(5))
+    for frame in frames:
+        boxes = {track.object: track.box for track in frame.tracks}
+        assert boxes == {"anna": Box(10 + frame.number, 20, 30, 40), "ben": Box(200, 20, 30, 40)}
+        assert {track.source_frame for track in frame.tracks} == {2 * frame.number}
+
+
+@pytest.mark.parametrize(
+    ("form", "words"),
+    [
+        ({"columns": COLUMNS[1:]}, "lacks the column frame"),
+        ({"columns": [*COLUMNS[:3], *COLUMNS[5:]]}, "lacks the column x, y"),
+        ({"columns": COLUMNS, "change": lambda rows: [row | {"state": "hidden"} for row in rows]},
+         "line 2 is no track .column state: expected .* got 'hidden'"),
+        ({"columns": COLUMNS, "change": lambda rows: [*rows, rows[3]]}, "two rows of ben in frame 1"),
+        ({"columns": COLUMNS, "change": lambda rows: [row | {"frame": 0.5} for row in rows]}, "line 2 .* whole number"),
+    ],
+)  # fmt: skip
+def test_a_csv_file_that_is_ambiguous_is_an_error_that_says_what_is_wrong(tmp_path, form, words):
+    with pytest.raises(VideoError, match=words):
+        list(Log(table(tmp_path / "t.csv", **form)))
+
+
+@pytest.mark.parametrize("name", ["t.ndjson", "t.csv", "t.sqlite"])
+def test_a_log_that_another_process_writes_is_refused_with_its_number(tmp_path, name):
+    program = (
+        "import sys; from catstream.output.destinations import Head, Origin, open_sink\n"
+        "sink = open_sink(sys.argv[1], Origin()); print('open', flush=True); sys.stdin.read()"
+    )
+    path = tmp_path / name
+    command = [sys.executable, "-P", "-c", program, path]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as writer:
+        writer.stdout.readline()
+        run = RunFiles(Origin(), None, [str(path)])
+        for refused in (lambda: run.check(overwrite=True, earlier=[]), lambda: open_sink(str(path), Origin())):
+            with pytest.raises(VideoError, match=rf"{name} is being written by process {writer.pid}: stop it"):
+                refused()
+        writer.kill()
+    run.check(overwrite=True, earlier=[])
+    open_sink(str(path), Origin()).close()
+
+
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        *product(["t.ndjson", "t.csv", "t.sqlite"], ["removed", "renamed", "replaced", "folder"]),
+        *product(["t.ndjson", "t.csv"], ["truncated"]),
+    ],
+)
+def test_a_log_that_is_removed_or_truncated_is_written_anew_and_that_is_said_once(tmp_path, caplog, name, change):
+    path = tmp_path / "out" / name
+    path.parent.mkdir()
+    with closing(open_sink(str(path), Origin())) as sink:
+        for number in range(6):
+            sink.write(TrackedFrame([track(number)]))
+            if number == 2:
+                {
+                    "removed": path.unlink,
+                    "renamed": lambda: path.rename(tmp_path / "t.old"),
+                    "replaced": lambda: (path.unlink(), path.touch()),
+                    "folder": lambda: path.parent.rename(tmp_path / "old"),
+                    "truncated": lambda: os.truncate(path, 0),
+                }[change]()
+    assert [frame.number for frame in Log(path)] == [3, 4, 5]
+    assert b"\0" not in path.read_bytes() or name == "t.sqlite"
+    (message,) = caplog.messages
+    assert "truncated by another program" in message or "removed or renamed by another program" in message
+
+
+def test_csv_and_database_are_made_again_from_the_ndjson_log_when_a_run_is_resumed(tmp_path):
+    places = [str(tmp_path / name) for name in ("t.csv", "t.sqlite", "t.ndjson")]
+    run = RunFiles(Origin(), None, places)
+    add(run, [[""]] * 5)
+    Path(places[0]).write_text("whatever a power cut has left")
+    Path(places[1]).unlink()
+    add(run, [[""]] * 9, first=run.position()[0], resume=True)
+    for place in places:
+        assert [frame.number for frame in Log(Path(place))] == list(range(9))
+
+
+def test_all_files_of_a_run_are_different_also_through_links(tmp_path):
+    log = tmp_path / "t.csv"
+    log.touch()
+    (tmp_path / "sub").mkdir()
+    (tmp_path / "soft").symlink_to(log)
+    (tmp_path / "hard").hardlink_to(log)
+    for other in (tmp_path / "sub" / ".." / "t.csv", tmp_path / "soft", tmp_path / "hard"):
+        with pytest.raises(VideoError, match=r"is both the destination .*t\.csv and the saved model of anna"):
+            RunFiles(Origin(), None, [str(log)]).check(
+                overwrite=True, earlier=[], others={"the saved model of anna": other}
+            )
+
+
+def test_logs_that_were_joined_have_a_head_each_and_the_frames_of_both(tmp_path):
+    tracks = [json.dumps(track(number).to_dict()) for number in (0, 1)]
+    parts = [Head(size=(4, 3)).to_json(), tracks[0], Head().to_json(), tracks[1]]
+    log = tmp_path / "t.ndjson"
+    log.write_text("".join(f"{part}\n" for part in parts))
+    assert [frame.number for frame in Log(log)] == [0, 1]
+    assert Log(log).head() == Head(size=(4, 3))

@@ -1,0 +1,163 @@
+"""The files of a run: what it is, for its processes and for whoever resumes it, and who may have its state."""
+
+import os
+import stat
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from catstream.base.box import Box
+from catstream.base.settings import Settings
+from catstream.errors import ProtocolError, ServiceError
+from catstream.processes.job import Job, Results
+from catstream.processes.state import files, locked, locked_for_run, restore
+from catstream.wire import storage
+
+JOB = Job("rtsp://me:secret@10.0.0.7/one", {"anna": Box(1, 2, 30, 40)}, part=slice(0, None, 1), size=(320, 240))
+
+numbers = st.none() | st.integers(0, 10**6) | st.integers(0, 10**6).map(np.int64)
+paths = st.none() | st.text(st.characters(codec="utf-8", exclude_characters="\0"), min_size=1).map(Path)
+model_files = st.dictionaries(st.sampled_from(["ben", "carl"]), st.text("ab/.", min_size=1).map(Path))
+jobs = st.builds(
+    Job,
+    source=st.text(),
+    boxes=st.dictionaries(st.sampled_from(["", "anna"]), st.just(Box(1, 2, 30, 40))),
+    models=model_files,
+    part=st.builds(slice, numbers, numbers, numbers),
+    settings=st.builds(lambda lag: Settings(run={"lag_frames": lag}), st.integers(0, 100)),
+    size=st.none() | st.tuples(st.integers(1, 9000), st.integers(1, 9000)),
+    results=st.builds(
+        Results,
+        *(paths, st.booleans(), st.lists(st.text("ab/.", min_size=1).map(Path)).map(tuple), model_files),
+        rotate=st.none() | st.just("1d"),
+        keep=st.none() | st.integers(1, 99),
+    ),
+    state=paths,
+    since=st.none() | st.floats(0, 1e9),
+    resume=st.booleans(),
+)
+
+
+@given(jobs)
+def test_a_job_is_read_as_it_was_written(tmp_path_factory, job):
+    folder = tmp_path_factory.getbasetemp()
+    assert Job.load(job.save(folder)) == Job.load(folder) == job
+
+
+def test_the_file_of_a_job_is_private_from_its_first_byte(tmp_path, monkeypatch):
+    before = os.umask(0)
+    try:
+        left = tmp_path / f".job.safetensors.{0:016x}.part"
+        left.write_text("what a power cut left of an older catstream")
+        os.utime(left, (0, 0))
+        modes, fsync = [], os.fsync
+        monkeypatch.setattr(os, "fsync", lambda handle: (modes.append(os.fstat(handle).st_mode), fsync(handle)))
+        file = JOB.save(tmp_path)
+    finally:
+        os.umask(before)
+    assert list(tmp_path.iterdir()) == [file]
+    assert {stat.S_IMODE(mode) for mode in (modes[0], file.stat().st_mode)} == {0o600}
+
+
+def test_a_job_that_is_shown_does_not_show_its_password():
+    assert "secret" not in repr(JOB)
+
+
+def test_a_job_that_is_not_there_or_damaged_is_an_error_that_names_the_file(tmp_path):
+    with pytest.raises(ServiceError, match="'my runs' contains no run: start one with --state 'my runs'"):
+        Job.load(Path("my runs"))
+    file = JOB.save(tmp_path)
+    file.write_bytes(file.read_bytes().replace(b"320", b"321"))
+    with pytest.raises(ProtocolError, match="checksum"):
+        Job.load(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("field", "value"), [("size", [320]), ("resume", "yes"), ("models", ["ben"]), ("boxes", {"": [1, 2]}), ("part", 3)]
+)
+def test_a_field_of_another_type_is_an_error(tmp_path, field, value):
+    file = JOB.save(tmp_path)
+    storage.write(file, {}, storage.read_metadata(file) | {field: value})
+    with pytest.raises(ProtocolError, match="is not a valid job of a pipeline"):
+        Job.load(file)
+
+
+def test_a_copy_of_a_process_that_lives_longer_does_not_keep_its_lock(tmp_path):
+    lives, ends = os.pipe()
+    with locked(tmp_path / "kept"):
+        if not os.fork():
+            os.close(ends)
+            os.read(lives, 1)
+            os._exit(0)
+    with locked(tmp_path / "kept"):
+        os.close(ends)
+    os.wait()
+    os.close(lives)
+
+
+def test_a_folder_is_locked_by_one_process_and_free_once_that_is_killed(tmp_path):
+    script = (
+        "import pathlib, time\nfrom catstream.processes.state import locked\n"
+        f"with locked(pathlib.Path({str(tmp_path)!r})):\n    print(flush=True)\n    time.sleep(600)"
+    )
+    with subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE) as owner:
+        owner.stdout.readline()
+        with pytest.raises(ServiceError, match="stop it, or use another folder"), locked(tmp_path):
+            pass
+        owner.kill()
+    with locked(tmp_path):
+        pass
+
+
+def test_a_saved_model_that_is_stored_while_a_state_is_read_is_in_it_if_it_is_named(tmp_path, monkeypatch):
+    for name in ("trees/000001.safetensors", "desired_state.json"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text("{}")
+    read_bytes = Path.read_bytes
+
+    def read(path):
+        if path.suffix == ".json":  # the detector stores a saved model, and then the state that names it
+            (tmp_path / "searched_models").mkdir(exist_ok=True)
+            (tmp_path / "searched_models" / "0a.safetensors").write_text("model")
+            path.write_text('{"model": "0a"}')
+        return read_bytes(path)
+
+    monkeypatch.setattr(Path, "read_bytes", read)
+    content = files(tmp_path)
+    assert b"0a" in content["desired_state.json"]
+    assert "searched_models/0a.safetensors" in content
+
+
+def test_a_state_is_restored_with_its_searched_models_and_newest_checkpoint(tmp_path):
+    names = ["desired_state.json", "job.safetensors", "searched_models/0af3.safetensors", "trees/000002.safetensors"]
+    for name in [*names, "trees/000001.safetensors", "log", "searched_models/.part"]:
+        (tmp_path / "old" / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "old" / name).write_text(name)
+    content = files(tmp_path / "old")
+    assert sorted(content) == names
+    restore(tmp_path / "new", content)
+    assert all((tmp_path / "new" / name).read_text() == name for name in names)
+
+
+def test_a_resumed_run_writes_its_own_list_of_files_or_else_the_earlier_one():
+    earlier = Results(Path("out"), video=True, write=(Path("a.csv"), Path("b.sqlite")))
+    assert Results().after(earlier) == earlier
+    assert Results(write=(Path("c.csv"),)).after(earlier).write == (Path("c.csv"),)
+    assert Results(video=False, write=()).after(earlier) == Results(Path("out"), video=False, write=())
+    rotated = Results(rotate="1d", keep=30)
+    assert Results().after(rotated) == rotated
+    assert Results(keep=7).after(rotated) == Results(rotate="1d", keep=7)
+
+
+def test_a_state_folder_without_its_job_is_not_said_to_be_resumable(tmp_path):
+    (tmp_path / "trees").mkdir()
+    with (
+        pytest.raises(ServiceError, match=r"without its job\.safetensors, which cannot be continued: use another"),
+        locked_for_run(tmp_path, None, JOB),
+    ):
+        pass
