@@ -25,7 +25,7 @@ from catstream.errors import BoxError, CatstreamError, ServiceError, VideoError
 from catstream.multi import MultiTracker
 from catstream.offline.annotation import Annotation
 from catstream.offline.keyframes import Keyframe, KeyframeBox, by_object, format_keyframe, parse_row
-from catstream.output.destinations import Head, Origin, TrackedFrame
+from catstream.output.destinations import Header, Origin, TrackedFrame
 from catstream.output.track_log import Log, RunFiles, places_of
 from catstream.processes.job import Results
 from catstream.video.source import open_source
@@ -133,7 +133,7 @@ def check_results(videos: Iterable[Video], output: Path) -> None:
         if not (output / SUMMARIES).exists():
             _files(video, output, overwrite=False)
         elif log.exists() and log.stat().st_size:  # an emptied log is tracked again, as a removed one
-            source = (Log(log).head() or Head()).source
+            source = (Log(log).header() or Header()).source
             if os.path.realpath(source) != os.path.realpath(video.path):
                 raise VideoError(
                     f"{log} is the log of {source or 'another run'}, not of {video.path}: pass another --output, or "
@@ -198,8 +198,8 @@ def track_video(video: Video, output: Path, settings: Settings) -> Summary:
     summary = Summary(video.file, len(video.keyframes), boxes=video.boxes)
     try:
         with one_thread(opencv=True), ExitStack() as stack:
-            head, frames = _frames(video, settings, stack)
-            files = _files(video, output, head, overwrite=True)
+            header, frames = _frames(video, settings, stack)
+            files = _files(video, output, header, overwrite=True)
             output_files = stack.enter_context(files.opened(""))
             for frame in frames:
                 output_files.write(frame)
@@ -219,15 +219,15 @@ def read_summaries(path: Path) -> list[Summary]:
         raise VideoError(f"{path} is not the table of a batch ({error}): pass another --output") from None
 
 
-def _files(video: Video, output: Path, head: Head | None = None, *, overwrite: bool) -> RunFiles:
+def _files(video: Video, output: Path, header: Header | None = None, *, overwrite: bool) -> RunFiles:
     """The files of a video; VideoError if they exist, unless `overwrite`, or cannot be written."""
-    origin = Origin(head or Head(source=str(video.path)))
+    origin = Origin(header or Header(source=str(video.path)))
     files = RunFiles(origin, output, places_of(video.name, Results(output=output)))
     files.check(overwrite=overwrite, earlier=[])
     return files
 
 
-def _frames(video: Video, settings: Settings, stack: ExitStack) -> tuple[Head, Iterator[TrackedFrame]]:
+def _frames(video: Video, settings: Settings, stack: ExitStack) -> tuple[Header, Iterator[TrackedFrame]]:
     """The tracks of all objects of a video, frame by frame."""
     several = {name: boxes for name, boxes in video.keyframes.items() if len(boxes) > 1}
     single = {name: boxes for name, boxes in video.keyframes.items() if len(boxes) == 1}
@@ -239,23 +239,23 @@ def _frames(video: Video, settings: Settings, stack: ExitStack) -> tuple[Head, I
     annotation.track()
     frames = annotation.frames
     changed = tuple(annotation.settings.changed())
-    head = Head(source=str(video.path), size=frames.size, rate=frames.rate, frames=len(frames), settings=changed)
+    header = Header(source=str(video.path), size=frames.size, rate=frames.rate, frames=len(frames), settings=changed)
 
     # Step 2: add the others from their boxes on. Their own run would begin at frame 0.
     def merged() -> Iterator[TrackedFrame]:
-        part, others = _tracked(video.path, single, settings, stack) if single else (Head(), iter(()))
+        part, others = _tracked(video.path, single, settings, stack) if single else (Header(), iter(()))
         for number, tracks in enumerate(zip(*annotation.tracks.values(), strict=True)):
             added = next(others, TrackedFrame([])).tracks if number >= part.start else ()
             shifted = (replace(track, frame=number, began=track.began + part.start) for track in added)
             yield TrackedFrame([*tracks, *shifted])
         next(others, None)  # raises the error of a box after the last frame
 
-    return head, merged()
+    return header, merged()
 
 
 def _tracked(
     path: Path, keyframes: Mapping[str, Mapping[int, KeyframeBox]], settings: Settings, stack: ExitStack
-) -> tuple[Head, Iterator[TrackedFrame]]:
+) -> tuple[Header, Iterator[TrackedFrame]]:
     """Track objects, each from its only box on; the same tracks as of `catstream track` in lockstep."""
     begins: dict[int, dict[str, Box]] = {}
     for name, boxes in keyframes.items():
@@ -266,7 +266,7 @@ def _tracked(
     first = min(begins, default=0)
     source = stack.enter_context(open_source(str(path), part=slice(first, None), settings=settings.run))
     settings = settings.for_length(source.frames)
-    head = Head(
+    header = Header(
         source=str(path),
         size=source.size,
         rate=source.rate,
@@ -290,4 +290,4 @@ def _tracked(
                 f"{listed(boxes)}: frame {frame_number} is outside the video: pass a frame from 0 to {number}"
             )
 
-    return head, frames()
+    return header, frames()

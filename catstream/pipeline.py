@@ -24,7 +24,7 @@ from catstream.base.forks import check_not_forked, forked, generation
 from catstream.base.names import Boxes
 from catstream.base.settings import Settings
 from catstream.errors import ServiceError, SettingsError
-from catstream.output.destinations import Head
+from catstream.output.destinations import Header
 from catstream.processes.job import Job, Models, Results, files_by_name
 from catstream.processes.probe import probe
 from catstream.processes.start_server import start_server
@@ -279,10 +279,10 @@ class Pipeline:
         return self._supervisor
 
     @property
-    def head(self) -> Head:
-        """The head of the log of the run."""
+    def header(self) -> Header:
+        """The header of the log of the run."""
         stride = self.part.step or 1
-        return Head(
+        return Header(
             source=without_password(self.source),
             size=self.size,
             rate=self.rate * stride,

@@ -286,13 +286,13 @@ class _ResultFiles:
         write_table(self._next, ("frame", "object", "errors"), rows, VideoError)
 
     def _log(self) -> RunFiles:
-        from catstream.output.destinations import Head, Origin
+        from catstream.output.destinations import Header, Origin
         from catstream.output.track_log import RunFiles, places_of
 
         frames = self._annotation.frames
         changed = tuple(self._annotation.settings.changed())
-        head = Head(source=self._video, size=frames.size, rate=frames.rate, frames=len(frames), settings=changed)
-        return RunFiles(Origin(head), self.folder, places_of(frames.name, Results(output=self.folder)))
+        header = Header(source=self._video, size=frames.size, rate=frames.rate, frames=len(frames), settings=changed)
+        return RunFiles(Origin(header), self.folder, places_of(frames.name, Results(output=self.folder)))
 
 
 def _report(annotation: Annotation) -> None:

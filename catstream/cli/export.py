@@ -16,7 +16,7 @@ from catstream.cli.write import with_table
 from catstream.errors import VideoError
 from catstream.output import exports
 from catstream.output.annotations import About, classes_of
-from catstream.output.destinations import Head
+from catstream.output.destinations import Header
 from catstream.output.exports import EXPORTS
 from catstream.output.track_log import JoinedLog, logs_of
 from catstream.video.source import VIDEOS, open_source
@@ -102,7 +102,9 @@ def export(
         exports.check_export(dest, form, overwrite=overwrite, log=file)
     for content in logs:
         path = content.path
-        about = About(path.stem, content.head() or Head(), label=label, classes=classes, is_first=content is logs[0])
+        about = About(
+            path.stem, content.header() or Header(), label=label, classes=classes, is_first=content is logs[0]
+        )
         if len(logs) > 1:
             about = replace(about, prefix=f"{path.stem}_")
         about = _with_source(about, path, source, required=images, useful=form.images)
@@ -121,7 +123,7 @@ def _with_source(about: About, log: Path, given: str | None, *, required: bool, 
     required  whether the images are written
     useful    whether the format refers to them
     """
-    source, size = given or about.head.source, about.head.size
+    source, size = given or about.header.source, about.header.size
     if required and (not source or is_live(source)):
         raise VideoError(f"{log} names no source with images: pass --source, or omit --images")
     if given or (useful and source and not is_live(source)):

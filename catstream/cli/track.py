@@ -205,7 +205,7 @@ class _Run:
         pipeline, results = self.pipeline, self.pipeline.results
         places = [*places_of(pipeline.name, results), *([STDOUT] if self.stdout else [])]
         options = SinkOptions(rotate=parse_rotation(results.rotate) if results.rotate else None, keep=results.keep or 0)
-        origin = Origin(pipeline.head, Address(keys=pipeline.settings.run.keys), options)
+        origin = Origin(pipeline.header, Address(keys=pipeline.settings.run.keys), options)
         return RunFiles(origin, results.output, places)
 
     def check(self) -> None:

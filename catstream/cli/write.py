@@ -21,7 +21,7 @@ from catstream.cli.options import Command
 from catstream.client.address import Address
 from catstream.client.attach import REPORT_SECONDS, subscribe
 from catstream.errors import SettingsError, SilenceError
-from catstream.output.destinations import SINKS, Head, Origin, TrackedFrame
+from catstream.output.destinations import SINKS, Header, Origin, TrackedFrame
 from catstream.output.events import check_zones
 from catstream.output.options import OPTIONS, parse
 from catstream.output.track_log import RunFiles
@@ -72,18 +72,18 @@ def _with_options(command: Command) -> Command:
     return whole
 
 
-def _head(address: Address) -> Head:
-    """The head of a log, as far as the detector of the pipeline reports the run."""
-    head = Head()
+def _header(address: Address) -> Header:
+    """The header of a log, as far as the detector of the pipeline reports the run."""
+    header = Header()
     with subscribe(address, "health", timeout=REPORT_SECONDS) as reports, suppress(SilenceError):
         for report in islice(reports, _REPORTS):
             if report.process == "detector":
                 of = report.counters
-                head = Head(source=report.source)
+                header = Header(source=report.source)
                 if "width" in of:  # its source is open
                     size, rate, stride = (int(of["width"]), int(of["height"])), of["rate"], int(of["stride"])
-                    return replace(head, size=size, rate=rate * stride, start=int(of["start"]), stride=stride)
-    return head
+                    return replace(header, size=size, rate=rate * stride, start=int(of["start"]), stride=stride)
+    return header
 
 
 @click.command()
@@ -125,8 +125,8 @@ def sink(places: tuple[str, ...], values: dict[str, Any], address: Address, wait
     with subscribe(address, "tracks") as tracks:
         with suppress(KeyboardInterrupt), ExitStack() as stack:
             wait_for_pipeline(address, wait)
-            origin = Origin(_head(address), address, options, attached=True)
-            check_zones(options.zone, origin.head.size)
+            origin = Origin(_header(address), address, options, attached=True)
+            check_zones(options.zone, origin.header.size)
             outputs = stack.enter_context(replace(files, origin=origin).continued(address.endpoint, resume=False))
             status = stack.enter_context(Console(stderr=True).status("waiting for a track"))
             for track in with_silence_warnings(tracks, outputs.idle):

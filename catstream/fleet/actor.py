@@ -198,7 +198,7 @@ class Stream:
         """The destinations of the tracks. If this node has a log, the run continues its frame numbers."""
         options = self._spec.options
         check_zones(options.zone, pipeline.size)
-        origin = Origin(pipeline.head, Address(keys=pipeline.settings.run.keys), options)
+        origin = Origin(pipeline.header, Address(keys=pipeline.settings.run.keys), options)
         files = RunFiles(origin, None, list(self._spec.write))
         if resume and any(path.exists() for path in map(Path, files.places) if is_log(path)):
             pipeline.first_frame, pipeline.first_time = files.position()

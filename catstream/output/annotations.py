@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 from catstream.base.box import Box
 from catstream.base.text import counted
 from catstream.errors import VideoError
-from catstream.output.destinations import Head, TrackedFrame
+from catstream.output.destinations import Header, TrackedFrame
 from catstream.video.frames import jpeg
 from catstream.video.source import open_source
 from catstream.wire.messages import Track
@@ -54,7 +54,7 @@ class About:
     """The parameters of an export.
 
     name     name of the log, for the images
-    head     head of the log; an empty one if the log has none
+    header   header of the log; an empty one if the log has none
     size     width and height of a frame in pixels; None if unknown
     frames   number of frames of the source; None if unknown
     label    class of all objects; empty if the name of each is its class
@@ -66,7 +66,7 @@ class About:
     """
 
     name: str
-    head: Head = field(default_factory=Head)
+    header: Header = field(default_factory=Header)
     size: tuple[int, int] | None = None
     frames: int | None = None
     label: str = ""
@@ -123,7 +123,7 @@ def write_cvat(frames: Iterable[TrackedFrame], path: Path, about: About) -> str:
     has no such end. If `about.frames` is None, this is the last frame of the log; returns a line that says so.
     """
     objects: dict[int, list[_Place]] = {}
-    end, step = 0, about.head.stride
+    end, step = 0, about.header.stride
     for frame, places in _places(frames, about):
         end = frame + 1
         for place in places:

@@ -16,7 +16,7 @@ from catstream.base.box import Box
 from catstream.base.files import REMEDIES, open_locked
 from catstream.base.text import counted
 from catstream.errors import VideoError
-from catstream.output.destinations import Head, Origin, Sink, TrackedFrame
+from catstream.output.destinations import Header, Origin, Sink, TrackedFrame
 from catstream.output.remote import Warnings
 from catstream.wire.messages import Track
 
@@ -58,7 +58,7 @@ class SqliteSink(Sink):
     """
 
     def __init__(self, place: str, origin: Origin) -> None:
-        self._place, self._head, self._warnings = place, origin.head, Warnings(place)
+        self._place, self._header, self._warnings = place, origin.header, Warnings(place)
         self._waiting: deque[TrackedFrame] = deque()
         self.missed = 0
         self._database: sqlite3.Connection | None = None
@@ -120,7 +120,7 @@ class SqliteSink(Sink):
             database.execute("PRAGMA journal_mode = WAL")  # readers do not block the run
             database.execute("PRAGMA synchronous = NORMAL")
             with database:
-                create(database, self._head)
+                create(database, self._header)
             stack.pop_all()
         return database
 
@@ -137,18 +137,18 @@ class SqliteSink(Sink):
         self._lock = open_locked(path, VideoError, None)
 
 
-def create(database: sqlite3.Connection, head: Head) -> None:
+def create(database: sqlite3.Connection, header: Header) -> None:
     """Create the tables of a log that has none yet."""
     database.execute(_CREATE)
-    if not database.execute("SELECT 1 FROM sqlite_master WHERE name = 'head'").fetchone():
-        database.execute("CREATE TABLE head (json TEXT NOT NULL) STRICT")
-        database.execute("INSERT INTO head VALUES (?)", (head.to_json(),))
+    if not database.execute("SELECT 1 FROM sqlite_master WHERE name = 'header'").fetchone():
+        database.execute("CREATE TABLE header (json TEXT NOT NULL) STRICT")
+        database.execute("INSERT INTO header VALUES (?)", (header.to_json(),))
 
 
-def write_database(frames: Iterable[TrackedFrame], path: Path, head: Head) -> None:
+def write_database(frames: Iterable[TrackedFrame], path: Path, header: Header) -> None:
     """Write all frames to a new database."""
     with _errors(path), closing(sqlite3.connect(path)) as database, database:
-        create(database, head)
+        create(database, header)
         database.executemany(_INSERT, rows(frames))
 
 
@@ -164,12 +164,12 @@ def read_database(path: Path) -> Iterator[TrackedFrame]:
             yield TrackedFrame([*tracks])
 
 
-def read_database_head(path: Path) -> Head | None:
-    """The head of the log in a database; None if it has none."""
+def read_database_header(path: Path) -> Header | None:
+    """The header of the log in a database; None if it has none."""
     with _errors(path, "read"), closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=rw", uri=True)) as database:
-        if not database.execute("SELECT 1 FROM sqlite_master WHERE name = 'head'").fetchone():
+        if not database.execute("SELECT 1 FROM sqlite_master WHERE name = 'header'").fetchone():
             return None
-        return Head.from_json(database.execute("SELECT json FROM head").fetchone()[0])
+        return Header.from_json(database.execute("SELECT json FROM header").fetchone()[0])
 
 
 def rows(frames: Iterable[TrackedFrame]) -> Iterator[tuple[Any, ...]]:

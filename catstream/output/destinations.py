@@ -33,7 +33,7 @@ from catstream.wire.messages import Track
 #: Stands for standard output.
 STDOUT = "-"
 
-#: Version of the format of a log, in its head.
+#: Version of the format of a log, in its header.
 FORMAT = 1
 
 
@@ -52,11 +52,11 @@ class TrackedFrame(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Head:
-    """The first line of an NDJSON log, as JSON, and the table `head` of a database: the run that its tracks are of.
+class Header:
+    """The first line of an NDJSON log, as JSON, and the table `header` of a database: the run that its tracks are of.
 
     catstream  version of the format of the log
-    frame      -1: a program that reads the number of the frame in each line reads the head before frame 0
+    frame      -1: a program that reads the number of the frame in each line reads the header before frame 0
     source     path or address of the source, without a password; empty beside a running pipeline
     size       width and height of a frame, pixels; None if unknown
     rate       frames per second of the source; None if unknown
@@ -66,7 +66,7 @@ class Head:
     version    version of the program
     settings   NAME=VALUE of each setting that differs from its default
     boxes      initial box of each object that the run started with, by name
-    gap        0; in a further head, the number of frames before it that could not be written, as the disk was full
+    gap        0; in a further header, the number of frames before it that could not be written, as the disk was full
     """
 
     catstream: int = FORMAT
@@ -87,7 +87,7 @@ class Head:
 
     @classmethod
     def from_json(cls, text: str | bytes) -> Self | None:
-        """Read the head of a log; None if the text is not a head, VideoError if it is from another version."""
+        """Read the header of a log; None if the text is not a header, VideoError if it is from another version."""
         try:
             written = json.loads(text)["catstream"]
         except (ValueError, TypeError, KeyError):
@@ -100,7 +100,7 @@ class Head:
         try:
             return msgspec.json.decode(text, type=cls)
         except msgspec.ValidationError as error:
-            raise VideoError(f"the head of the log is invalid ({error})") from None
+            raise VideoError(f"the header of the log is invalid ({error})") from None
 
 
 class Rotation(NamedTuple):
@@ -138,7 +138,7 @@ class SinkOptions:
 class Origin:
     """The run whose tracks a sink writes.
 
-    head      of its log
+    header    of its log
     address   of the running pipeline, for a sink that also receives pictures
     options   of the destinations
     attached  whether another program runs the pipeline: its source is not read a second time
@@ -147,7 +147,7 @@ class Origin:
     gap       frames that could not be written because the sink could not be opened
     """
 
-    head: Head = field(default_factory=Head)
+    header: Header = field(default_factory=Header)
     address: Address = field(default_factory=Address)
     options: SinkOptions = field(default_factory=SinkOptions)
     attached: bool = False
@@ -196,8 +196,8 @@ class Row(NamedTuple):
 
 #: The suffix of a file, the scheme of an address such as "mqtt://", "/" for a folder, or "-" -> the sink.
 SINKS = {
-    ".ndjson": Row("track_log.NdjsonSink", "the log: one JSON object per line, after a head"),
-    STDOUT: Row("track_log.StdoutSink", "the same, without the head, on standard output"),
+    ".ndjson": Row("track_log.NdjsonSink", "the log: one JSON object per line, after a header"),
+    STDOUT: Row("track_log.StdoutSink", "the same, without the header, on standard output"),
     ".csv": Row("track_log.CsvSink", "a row for each object and frame: frame, seconds, state, box, score ..."),
     ".sqlite": Row("database.SqliteSink", "the table tracks of a database, which others read meanwhile"),
     ".mp4": Row("video_sink.open_video", "the frames with their boxes drawn in"),

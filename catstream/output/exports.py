@@ -44,7 +44,7 @@ def write_csv(frames: Iterable[TrackedFrame], path: Path, _: About) -> None:
 
 
 def write_sqlite(frames: Iterable[TrackedFrame], path: Path, about: About) -> None:
-    write_database(frames, path, about.head)
+    write_database(frames, path, about.header)
 
 
 @dataclass(frozen=True, slots=True)

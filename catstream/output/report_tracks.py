@@ -18,7 +18,7 @@ from catstream.base.settings import RunSettings
 from catstream.base.tables import write_table
 from catstream.base.text import counted
 from catstream.errors import VideoError
-from catstream.output.destinations import Head
+from catstream.output.destinations import Header
 from catstream.output.report import clock, write_page
 from catstream.output.track_log import Log
 from catstream.video.drawing import Colours, draw
@@ -132,7 +132,7 @@ class Section:
     """The part of the report about a video, from a log with tracks; its attributes are the values of the template."""
 
     def __init__(self, log: Log, scale: Scale) -> None:
-        self._log, self.name, self._head, self.unit = log, log.path.stem, log.head() or Head(), scale.unit
+        self._log, self.name, self._header, self.unit = log, log.path.stem, log.header() or Header(), scale.unit
         tracks: dict[tuple[str, int], list[Track]] = {}
         for frame in self._log:
             for track in frame.tracks:
@@ -142,7 +142,7 @@ class Section:
         for (name, began), rows in tracks.items():  # another object that reuses a name has a label of its own
             is_other = name in self._labels.values()
             self._labels[name, began] = f"{name}@{rows[0].source_frame}" if is_other else name
-        rate = self._head.rate or RATE
+        rate = self._header.rate or RATE
         self._objects = {label: _Object(tracks[key], rate, scale) for key, label in self._labels.items()}
         self._palette = Colours()
         self.colours = {label: self._palette.of(label) for label in self._objects}
@@ -156,17 +156,17 @@ class Section:
 
     def add_pictures(self) -> None:
         """Read the frames to look at from the source; note a problem if it cannot be read."""
-        if not self._head.source or is_live(self._head.source):
+        if not self._header.source or is_live(self._header.source):
             self.problem = "the log names no video"
         elif frames := self._frames_to_look_at():
             numbered = ((frame.tracks[0].source_frame, frame.tracks) for frame in self._log)
             logged = {number: tracks for number, tracks in numbered if number in frames}
-            first, rate = min(frames), self._head.rate or RATE
+            first, rate = min(frames), self._header.rate or RATE
             # A run skips damaged frames and scales others, or ends at the first: in any case these are its frames.
             settings = RunSettings(image_rate=rate, skip_damaged=True, resize=True)
             try:
                 part = slice(first, max(frames) + 1)
-                with open_source(self._head.source, part=part, settings=settings) as source:
+                with open_source(self._header.source, part=part, settings=settings) as source:
                     for number, frame in enumerate(source, first):
                         if number in frames:
                             tracks = [replace(t, object=self._labels[t.object, t.began]) for t in logged[number]]

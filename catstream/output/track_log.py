@@ -32,9 +32,9 @@ from catstream.base.names import UNNAMED, check_name
 from catstream.base.tables import Columns, Row
 from catstream.base.text import listed
 from catstream.errors import VideoError
-from catstream.output.database import read_database, read_database_head
+from catstream.output.database import read_database, read_database_header
 from catstream.output.destinations import (
-    Head,
+    Header,
     Origin,
     Sink,
     TrackedFrame,
@@ -69,7 +69,7 @@ class LineSink(Sink):
 
     An existing file is replaced, or continued after its first `origin.size` bytes. If it is removed, renamed or
     truncated meanwhile, that is logged, and a file with a first line of its own continues. After an error, `write` may
-    be called again with the next frame: the file has no part of the frame before, and states the gap if it has a head.
+    be called again with the next frame: the file has no part of the frame before, and a header states the gap.
     """
 
     def __init__(self, place: str, origin: Origin) -> None:
@@ -167,17 +167,17 @@ class LineSink(Sink):
 
 
 class NdjsonSink(LineSink):
-    """After the head, a line of JSON for each track, as by `Track.to_dict`: a box is [x, y, w, h] or null."""
+    """After the header, a line of JSON for each track, as by `Track.to_dict`: a box is [x, y, w, h] or null."""
 
     def head_line(self, gap: int = 0) -> str:
-        return replace(self._origin.head, gap=gap).to_json()
+        return replace(self._origin.header, gap=gap).to_json()
 
     def line(self, track: Track, _: float) -> str:
         return json.dumps(track.to_dict())
 
 
 class StdoutSink(NdjsonSink):
-    """The tracks on standard output, without a head; each frame is seen at once."""
+    """The tracks on standard output, without a header; each frame is seen at once."""
 
     def __init__(self, _: str, origin: Origin) -> None:
         super().__init__("standard output", origin)
@@ -236,12 +236,12 @@ class Log:
     def __init__(self, path: Path, *, skip_damaged: bool = False) -> None:
         self.path, self.damaged, self.gap, self._skip = path, 0, 0, skip_damaged
 
-    def head(self) -> Head | None:
-        """Read the head; None if there is none, as in a CSV file. VideoError if another version has written it."""
+    def header(self) -> Header | None:
+        """Read the header; None if there is none, as in a CSV file. VideoError if another version has written it."""
         if self.path.suffix == ".sqlite":
-            return read_database_head(self.path)
+            return read_database_header(self.path)
         with self.path.open("rb") as file:
-            return Head.from_json(file.readline())
+            return Header.from_json(file.readline())
 
     def __iter__(self) -> Iterator[TrackedFrame]:
         """Yield the frames in their order, in whichever order the rows are; none if there is no file.
@@ -294,8 +294,9 @@ class Log:
                 try:
                     track = parse(line.decode("utf-8-sig"))
                 except ValueError as error:
-                    if (head := Head.from_json(line)) is not None:  # the first line of a log, a gap, an appended log
-                        self.gap += head.gap
+                    header = Header.from_json(line)
+                    if header is not None:  # the first line of a log, a gap, an appended log
+                        self.gap += header.gap
                         continue
                     problem = f"{self.path}, line {number} is no track ({error})"
                     is_cut = not line.endswith(b"\n") or not line.strip()
@@ -364,7 +365,7 @@ class JoinedLog(Log):
 
     def __init__(self, logs: Iterable[Log]) -> None:
         self._logs = sorted(logs, key=lambda log: next(iter(log)).number)
-        if len({(log.head() or Head()).source for log in self._logs}) > 1:
+        if len({(log.header() or Header()).source for log in self._logs}) > 1:
             raise VideoError("the logs are of several sources: pass the files of one run, or --format yolo")
         super().__init__(self._logs[-1].path)
 
@@ -429,7 +430,7 @@ class RunFiles:
         If `overwrite`, existing files may be replaced; files of an `earlier` part of this run are continued. All files,
         also the `others` that the run writes, by their purpose, have to be different.
         """
-        source = self.origin.head.source
+        source = self.origin.header.source
         files = [(f"the destination {place}", Path(place)) for place in self.places if is_file(place)]
         check_distinct([*files, *(others or {}).items()], VideoError)
         for place in self.places:
@@ -479,7 +480,7 @@ class RunFiles:
         log_origin = replace(origin, last=last, size=size)
         origins = {place: log_origin if Path(place) == path else origin for place in self.places}
         with ExitStack() as stack:
-            outputs = stack.enter_context(OpenFiles(origins, is_live=is_live(origin.head.source)))
+            outputs = stack.enter_context(OpenFiles(origins, is_live=is_live(origin.header.source)))
             for place in self.places:
                 outputs.write_to(place)
             # The other files are made again from the log.

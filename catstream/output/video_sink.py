@@ -6,7 +6,7 @@ from contextlib import suppress
 
 from catstream.client.attach import subscribe
 from catstream.errors import SilenceError, VideoError
-from catstream.output.destinations import Head, Origin, Sink, TrackedFrame
+from catstream.output.destinations import Header, Origin, Sink, TrackedFrame
 from catstream.video.drawing import Colours, draw, drawn_size, preview_image
 from catstream.video.frames import RATE
 from catstream.video.source import open_source
@@ -18,16 +18,18 @@ _BACKLOG = 256  # frames whose tracks wait for their picture
 
 def open_video(place: str, origin: Origin) -> Sink:
     """Open an MP4 of the frames of a source if they can be read a second time, else of the pipeline's pictures."""
-    return PictureVideo(place, origin) if origin.attached else SourceVideo(place, origin.head)
+    return PictureVideo(place, origin) if origin.attached else SourceVideo(place, origin.header)
 
 
 class SourceVideo(Sink):
     """An MP4 of the frames that have a track, with their tracks drawn in."""
 
-    def __init__(self, place: str, head: Head) -> None:
+    def __init__(self, place: str, header: Header) -> None:
         # The pipeline skips damaged frames and scales others, or ends at the first: in any case these are its frames.
-        part = slice(head.start, None, head.stride)
-        self._frames = open_source(head.source, part=part, image_rate=head.rate or RATE, skip_damaged=True, resize=True)
+        part = slice(header.start, None, header.stride)
+        self._frames = open_source(
+            header.source, part=part, image_rate=header.rate or RATE, skip_damaged=True, resize=True
+        )
         self._colours = Colours()
         try:
             aspect = self._frames.pixel_aspect

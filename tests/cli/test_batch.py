@@ -71,7 +71,7 @@ def test_an_object_with_one_box_is_tracked_as_by_a_tracker_from_its_frame_on(dem
                 tracker.update(frame.image, time=frame.time)
             expected.append(replace(tracker.tracks["anna"], source_frame=frame.number + 3))
     assert [track for frame in log for track in frame.tracks] == expected
-    assert (log.head().start, log.head().source) == (3, str(tmp_path / "two" / "cam.mp4"))
+    assert (log.header().start, log.header().source) == (3, str(tmp_path / "two" / "cam.mp4"))
 
 
 def test_only_videos_that_failed_or_have_other_boxes_are_tracked_again(demo, batch, demo_video, tmp_path):
@@ -100,7 +100,7 @@ def test_results_of_another_table_are_not_replaced_and_its_rows_stay(demo, batch
     assert [*summaries(tmp_path / "out")] == ["two/cam.mp4", "two/side.mp4"]
     other = table(tmp_path / "three", f"two/cam.mp4,anna,{demo[0]},")
     succeed("batch", other, *words, "--overwrite")
-    assert Log(tmp_path / "out" / "two_cam.ndjson").head().source == f"{tmp_path}/three/two/cam.mp4"
+    assert Log(tmp_path / "out" / "two_cam.ndjson").header().source == f"{tmp_path}/three/two/cam.mp4"
 
 
 @pytest.mark.parametrize("spoil", [Path.unlink, lambda log: os.truncate(log, 0)], ids=["removed", "emptied"])

@@ -10,7 +10,7 @@ import cv2
 import pytest
 
 from catstream.base.box import Box
-from catstream.output.destinations import Head
+from catstream.output.destinations import Header
 from catstream.wire.messages import Track
 
 
@@ -83,8 +83,8 @@ def test_images_of_several_folders_with_the_same_names_are_all_in_the_data_set(w
     for name in ("monday", "tuesday"):
         shutil.copytree(walk / "img", tmp_path / name)
         track = Track(0, 0.0, "present", Box(10, 20, 30, 40), 0.9, 1, object="anna")
-        head = Head(source=str(tmp_path / name), size=(320, 240))
-        (tmp_path / f"{name}.ndjson").write_text(f"{head.to_json()}\n{json.dumps(track.to_dict())}\n")
+        header = Header(source=str(tmp_path / name), size=(320, 240))
+        (tmp_path / f"{name}.ndjson").write_text(f"{header.to_json()}\n{json.dumps(track.to_dict())}\n")
     succeed("export", tmp_path, tmp_path / "set", "--format", "yolo", "--images")
     first = min(file.name for file in (walk / "img").iterdir())
     images = {file.name for file in (tmp_path / "set" / "images").iterdir()}

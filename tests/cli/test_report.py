@@ -10,7 +10,7 @@ import pytest
 
 from catstream.base.box import Box
 from catstream.errors import VideoError
-from catstream.output.destinations import Head
+from catstream.output.destinations import Header
 from catstream.video.source import open_source
 from catstream.wire.messages import Track
 
@@ -18,7 +18,7 @@ STATES = "PPPPDDAAPP"  # present, doubtful, absent
 
 
 def write_log(path, source="", names=("anna",), size=(320, 240), states=STATES):
-    lines = [Head(source=source, size=size, rate=10.0, frames=len(states)).to_json()]
+    lines = [Header(source=source, size=size, rate=10.0, frames=len(states)).to_json()]
     for number, state in enumerate(states):
         for name in names:
             box = None if state == "A" else Box(3 * number, 4 * number, 20, 30)
@@ -61,7 +61,7 @@ def test_a_report_has_shares_distance_and_mean_speed_of_each_object(succeed, fai
 
 def test_another_object_that_reuses_a_name_and_an_outage_are_not_joined(succeed, tmp_path):
     """Two objects named ben stand still in frames 100 to 119 of a video, which is lost for a minute in the middle."""
-    lines = [Head(rate=10.0, start=100).to_json()]
+    lines = [Header(rate=10.0, start=100).to_json()]
     for number in range(20):
         box, began = (Box(10, 10, 20, 20), 0) if number < 5 else (Box(300, 200 if number < 10 else 0, 20, 20), 5)
         time = 10 + number / 10 + (60 if number >= 10 else 0)
@@ -121,7 +121,7 @@ def test_the_logs_of_a_folder_have_a_section_each_and_names_are_escaped(succeed,
 def test_rotated_logs_are_one_section_in_which_frames_that_are_not_written_are_a_gap(succeed, tmp_path):
     whole = write_log(tmp_path / "gate.ndjson", states="PPPPPPPPPP").read_text().splitlines(keepends=True)
     (tmp_path / "gate-20261128T000000.ndjson").write_text("".join(whole[:5]))
-    (tmp_path / "gate.ndjson").write_text("".join([whole[0], Head(gap=3).to_json() + "\n", *whole[8:]]))
+    (tmp_path / "gate.ndjson").write_text("".join([whole[0], Header(gap=3).to_json() + "\n", *whole[8:]]))
     write_log(tmp_path / "gate-2.ndjson")
     _, errors = succeed("report", tmp_path, tmp_path / "page.html")
     assert "gate: the log lacks 3 frames" in errors
@@ -140,5 +140,5 @@ def test_rotated_logs_are_one_section_in_which_frames_that_are_not_written_are_a
 def test_a_report_of_something_else_is_an_error_of_one_line(fail, tmp_path, name, words):
     (tmp_path / "walk.txt").touch()
     (tmp_path / "empty").mkdir()
-    (tmp_path / "a.ndjson").write_text(Head().to_json() + "\n")
+    (tmp_path / "a.ndjson").write_text(Header().to_json() + "\n")
     assert words in fail("report", tmp_path / name)

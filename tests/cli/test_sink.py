@@ -45,13 +45,13 @@ def test_tracks_are_written_to_files_and_stay_there(long_video, catstream, tmp_p
 def holds(folder):
     """Return True once the folder has tracks and a picture."""
     file = folder / FILES[0]
-    return file.exists() and file.read_bytes().count(b"\n") > 1 and (folder / "walk.mp4").exists()  # below the head
+    return file.exists() and file.read_bytes().count(b"\n") > 1 and (folder / "walk.mp4").exists()  # below the header
 
 
 def written(folder, errors):
     """The frames whose tracks are there, in each of the files."""
-    head, *tracks = map(json.loads, (folder / "tracks.ndjson").read_text().splitlines())
-    assert (Path(head["source"]).name, head["size"], head["rate"]) == ("demo.mp4", [320, 240], 30)
+    header, *tracks = map(json.loads, (folder / "tracks.ndjson").read_text().splitlines())
+    assert (Path(header["source"]).name, header["size"], header["rate"]) == ("demo.mp4", [320, 240], 30)
     frames = [track["frame"] for track in tracks]
     assert frames == list(range(frames[0], frames[0] + len(frames)))
     assert f"{counted(len(frames), 'track')}, {frames[0]} missed" in errors, "those before it came"

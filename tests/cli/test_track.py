@@ -42,9 +42,9 @@ def test_it_writes_a_log_in_two_forms_and_a_video(whole_run):
     assert all(float(row["processing"]) >= 0 for row in rows)
     assert [int(row["frame"]) for row in rows] == list(range(32))
     assert {row["state"] for row in rows} <= {"bootstrapping", "present", "absent"}
-    head, *tracks = (out / "demo.ndjson").read_text().splitlines()
+    header, *tracks = (out / "demo.ndjson").read_text().splitlines()
     assert tracks == (whole_run / "stdout").read_text().splitlines()
-    assert head == Log(out / "demo.ndjson").head().to_json()
+    assert header == Log(out / "demo.ndjson").header().to_json()
     assert frames_of(out) == list(range(32))
     with open_source(out / "demo.mp4") as film:
         assert sum(1 for _ in film) == 32
@@ -56,10 +56,10 @@ def test_a_part_has_a_row_for_each_frame_that_was_followed(video, succeed, tmp_p
     _, errors = succeed("track", source, "--box", box, *part, "--output", out)
     assert str(out.name) in errors, "brackets in a path are printed as they are"
     assert [int(row["source_frame"]) for row in table(out / "demo.csv")] == list(range(4, 32, 4))
-    head = Log(out / "demo.ndjson").head()
-    stated = (head.source, head.size, head.rate, head.frames, head.start, head.stride)
+    header = Log(out / "demo.ndjson").header()
+    stated = (header.source, header.size, header.rate, header.frames, header.start, header.stride)
     assert stated == (source, (320, 240), 30, 7, 4, 4)
-    assert head.boxes == {"": Box.parse(box)}
+    assert header.boxes == {"": Box.parse(box)}
 
 
 def test_the_object_of_a_saved_model_is_found(whole_run, video, succeed, tmp_path):

@@ -52,7 +52,7 @@ def started(spec, store, node="n1", every=0.2, address=""):
 
 
 def frames_of(path):
-    """The numbers of the frames in a log, below its head."""
+    """The numbers of the frames in a log, below its header."""
     return [json.loads(line)["frame"] for line in path.read_text().splitlines()[1:]]
 
 

@@ -13,7 +13,7 @@ import pytest
 from catstream.base.box import Box
 from catstream.errors import VideoError
 from catstream.output import remote
-from catstream.output.destinations import Head, Origin, TrackedFrame, open_sink
+from catstream.output.destinations import Header, Origin, TrackedFrame, open_sink
 from catstream.output.track_log import Log, RunFiles
 from catstream.wire.messages import Track
 
@@ -129,7 +129,7 @@ def test_frames_beyond_those_that_wait_are_counted_and_reported_at_the_end(tmp_p
 
 
 def test_a_database_has_the_head_of_the_run_and_an_export_keeps_it(tmp_path):
-    head = Head(source="walk.mp4", size=(320, 240), start=100, stride=2)
-    with closing(open_sink(str(tmp_path / "t.sqlite"), Origin(head=head))) as sink:
+    header = Header(source="walk.mp4", size=(320, 240), start=100, stride=2)
+    with closing(open_sink(str(tmp_path / "t.sqlite"), Origin(header=header))) as sink:
         sink.write(TrackedFrame(TRACKS[:1]))
-    assert Log(tmp_path / "t.sqlite").head() == head
+    assert Log(tmp_path / "t.sqlite").header() == header

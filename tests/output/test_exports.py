@@ -12,7 +12,7 @@ from pycocotools.coco import COCO
 from catstream.base.box import Box
 from catstream.errors import VideoError
 from catstream.output.annotations import About
-from catstream.output.destinations import Head, Origin, TrackedFrame, open_sink
+from catstream.output.destinations import Header, Origin, TrackedFrame, open_sink
 from catstream.output.exports import export, export_of
 from catstream.output.track_log import Log
 from catstream.wire.messages import Track
@@ -155,7 +155,7 @@ def test_a_name_that_does_not_say_the_format_needs_the_option(tmp_path, name):
 
 def test_every_format_has_the_numbers_of_the_frames_in_the_source(tmp_path):
     log = [TrackedFrame([present(frame, "", source_frame=20 + 5 * frame)]) for frame in range(3)]
-    about = {"log": log, "size": (100, 80), "head": Head(start=20, stride=5), "frames": 40}
+    about = {"log": log, "size": (100, 80), "header": Header(start=20, stride=5), "frames": 40}
     files = {suffix: made(tmp_path / f"t{suffix}", **about) for suffix in (".txt", ".json", ".xml", ".via.csv")}
     mot = [int(line.split(",")[0]) - 1 for line in files[".txt"].read_text().splitlines()]
     coco = json.loads(files[".json"].read_text())["images"]

@@ -77,10 +77,10 @@ def run(request, exported):
 
 def boxes_in_csv(folder):
     """The boxes of a run: frame, number of the track, class, x, y, w, h, cut at the edges of the frame."""
-    head, *lines = map(json.loads, (folder / "walk.ndjson").read_text().splitlines())
+    header, *lines = map(json.loads, (folder / "walk.ndjson").read_text().splitlines())
     with (folder / "walk.csv").open() as file:
         rows = [*csv.DictReader(file)]
-    (width, height), numbers = head["size"], {}
+    (width, height), numbers = header["size"], {}
     for row, line in zip(rows, lines, strict=True):  # the beginning of an object is in the NDJSON file only
         number = numbers.setdefault((line["object"], line["began"]), len(numbers) + 1)
         if row["x"]:

@@ -23,7 +23,7 @@ from catstream.base.box import Box
 from catstream.base.files import REMEDIES
 from catstream.errors import VideoError
 from catstream.output import remote, track_log
-from catstream.output.destinations import Head, Origin, Rotation, SinkOptions, TrackedFrame, open_sink
+from catstream.output.destinations import Header, Origin, Rotation, SinkOptions, TrackedFrame, open_sink
 from catstream.output.track_log import JoinedLog, Log, RunFiles, places_of
 from catstream.processes.job import Results
 from catstream.video.rendered import write
@@ -94,7 +94,7 @@ def test_a_full_disk_is_reported_in_one_line_and_written_rows_are_kept(tmp_path,
 def test_a_full_disk_costs_a_live_source_rows_until_there_is_room_and_ends_a_file(
     disk, fill, names, source, caplog, monkeypatch
 ):
-    run = RunFiles(Origin(Head(source=source)), None, [str(disk / name) for name in names])
+    run = RunFiles(Origin(Header(source=source)), None, [str(disk / name) for name in names])
     frames = iter([TrackedFrame([track(number, "anna"), track(number, "ben")]) for number in range(10_000)])
     with run.opened("run") as outputs, ExitStack() as stack:
         for _ in range(20):
@@ -133,7 +133,7 @@ def test_a_live_run_begins_on_a_full_or_read_only_disk_and_is_written_once_that_
 ):
     log = Log(disk / "out" / name)
     live, file = (
-        RunFiles(Origin(Head(source=source)), disk / "out", [str(log.path)]) for source in ("rtsp://cam", "walk.mp4")
+        RunFiles(Origin(Header(source=source)), disk / "out", [str(log.path)]) for source in ("rtsp://cam", "walk.mp4")
     )
     ballast = fill() if state == "full" else remount("ro")
     live.check(overwrite=False, earlier=[])
@@ -162,7 +162,7 @@ def test_an_error_of_the_disk_is_said_once_with_path_reason_and_remedy_and_costs
         raise OSError(code, os.strerror(code))
 
     log = Log(tmp_path / "t.ndjson")
-    with RunFiles(Origin(Head(source="rtsp://cam")), None, [str(log.path)]).opened("run") as outputs:
+    with RunFiles(Origin(Header(source="rtsp://cam")), None, [str(log.path)]).opened("run") as outputs:
         for number in range(9):
             with monkeypatch.context() as disk:
                 if 3 <= number < 6:
@@ -176,7 +176,7 @@ def test_an_error_of_the_disk_is_said_once_with_path_reason_and_remedy_and_costs
 
 def test_a_log_that_cannot_be_renamed_grows_and_that_is_said_once(tmp_path, monkeypatch, caplog):
     path = tmp_path / "t.ndjson"
-    origin = Origin(Head(source="rtsp://cam"), options=SinkOptions(rotate=Rotation(inf, 1000)))
+    origin = Origin(Header(source="rtsp://cam"), options=SinkOptions(rotate=Rotation(inf, 1000)))
     with RunFiles(origin, None, [str(path)]).opened("run") as outputs, monkeypatch.context() as folder:
         folder.setattr(Path, "rename", partial(os.rename, path.parent / "none"))
         for number in range(50):
@@ -192,7 +192,7 @@ def test_the_logs_of_a_live_source_rotate_together_and_are_read_as_one(tmp_path,
     monkeypatch.setattr(track_log, "time", SimpleNamespace(time=lambda: next(clock)))
     options = SinkOptions(rotate=Rotation(inf, 1000), keep=5)
     run = RunFiles(
-        Origin(Head(source=source), options=options), None, [str(tmp_path / "t.ndjson"), str(tmp_path / "t.csv")]
+        Origin(Header(source=source), options=options), None, [str(tmp_path / "t.ndjson"), str(tmp_path / "t.csv")]
     )
     (tmp_path / "t-other.csv").touch()
     most = 0
@@ -311,16 +311,16 @@ def test_destinations_that_cannot_be_written_are_rejected_before_the_run(tmp_pat
 def test_the_source_is_not_replaced_and_a_live_one_gives_no_video(tmp_path):
     source, _ = write(tmp_path, 4, (320, 240))
     with pytest.raises(VideoError, match=r"demo\.mp4 is the source, which would be lost"):
-        RunFiles(Origin(Head(source=str(source))), None, [str(source)]).check(overwrite=True, earlier=[])
-    live = RunFiles(Origin(Head(source="rtsp://127.0.0.1/cam")), None, [str(tmp_path / "t.mp4")])
+        RunFiles(Origin(Header(source=str(source))), None, [str(source)]).check(overwrite=True, earlier=[])
+    live = RunFiles(Origin(Header(source="rtsp://127.0.0.1/cam")), None, [str(tmp_path / "t.mp4")])
     with pytest.raises(VideoError, match=r"but rtsp://127.0.0.1/cam is live"):
         live.check(overwrite=False, earlier=[])
 
 
 def test_a_video_has_the_frames_of_its_tracks(demo_video, tmp_path):
     source, _ = demo_video(8)
-    head = Head(source=str(source), start=1, stride=2)  # frames 1, 3, 5, 7, counted 0 to 3
-    sink = open_sink(str(tmp_path / "walk.mp4"), Origin(head))
+    header = Header(source=str(source), start=1, stride=2)  # frames 1, 3, 5, 7, counted 0 to 3
+    sink = open_sink(str(tmp_path / "walk.mp4"), Origin(header))
     for each in TRACKS:
         sink.write(TrackedFrame([each]))
     with pytest.raises(VideoError, match="has no frame 4"):
@@ -412,7 +412,7 @@ def test_a_csv_file_that_is_ambiguous_is_an_error_that_says_what_is_wrong(tmp_pa
 @pytest.mark.parametrize("name", ["t.ndjson", "t.csv", "t.sqlite"])
 def test_a_log_that_another_process_writes_is_refused_with_its_number(tmp_path, name):
     program = (
-        "import sys; from catstream.output.destinations import Head, Origin, open_sink\n"
+        "import sys; from catstream.output.destinations import Header, Origin, open_sink\n"
         "sink = open_sink(sys.argv[1], Origin()); print('open', flush=True); sys.stdin.read()"
     )
     path = tmp_path / name
@@ -481,8 +481,8 @@ def test_all_files_of_a_run_are_different_also_through_links(tmp_path):
 
 def test_logs_that_were_joined_have_a_head_each_and_the_frames_of_both(tmp_path):
     tracks = [json.dumps(track(number).to_dict()) for number in (0, 1)]
-    parts = [Head(size=(4, 3)).to_json(), tracks[0], Head().to_json(), tracks[1]]
+    parts = [Header(size=(4, 3)).to_json(), tracks[0], Header().to_json(), tracks[1]]
     log = tmp_path / "t.ndjson"
     log.write_text("".join(f"{part}\n" for part in parts))
     assert [frame.number for frame in Log(log)] == [0, 1]
-    assert Log(log).head() == Head(size=(4, 3))
+    assert Log(log).header() == Header(size=(4, 3))
