@@ -147,10 +147,10 @@ class Session:
             self.finished.set()
 
     def remaining(self) -> int:
-        """Number of frames that passes have to track, in both directions."""
+        """Number of frames that passes have to track, in both directions; 1 until those after a change are counted."""
         with self.lock:
             tracked = {task: count.stat().st_size for task, count in self._running.values()}
-            return sum(max(1, task.frames - tracked.get(task, 0)) for task in self._missing)
+            return max(int(self._wakes), sum(max(1, task.frames - tracked.get(task, 0)) for task in self._missing))
 
     def _replace(self, keyframes: dict[str, dict[int, KeyframeBox]]) -> None:
         if self.finished.is_set():

@@ -41,6 +41,13 @@ def test_boxes_are_saved_and_tracked_until_all_frames_are_checked(session, saved
     assert {track.checked for track in session.tracks["anna"]} == {"keyframe", "checked"}
 
 
+def test_a_session_has_remaining_frames_as_soon_as_a_box_is_drawn(session, demo, until):
+    until(lambda: not session.remaining())
+    with session.lock:  # its thread cannot look for the missing passes
+        session.draw("anna", 0, demo[1][0])
+        assert session.remaining()
+
+
 def test_a_change_that_is_undone_brings_the_earlier_box_and_passes_back(session, saved, demo, until):
     truth = demo[1]
     until(lambda: session.decoded)
@@ -103,7 +110,7 @@ def test_a_new_box_stops_the_passes_that_are_not_missing_any_more(session, demo,
     monkeypatch.setattr(module, "_LONG", 0)
     until(lambda: session.decoded)
     session.draw("anna", 0, demo[1][0].centred(60, 60))
-    until(session.remaining)
+    until(lambda: session.remaining() > 1)
     session.draw("anna", 0, demo[1][0])
     until(lambda: session.annotation.passes("anna") and not session.remaining())
     assert session.tracks["anna"][5].box.overlap(demo[1][5]) > 0.5
