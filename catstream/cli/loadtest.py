@@ -1,9 +1,11 @@
-"""`catstream loadtest`: the latency and the losses of pipelines under load."""
+"""`catstream loadtest`: the latency and the losses of pipelines under load, and a verdict as exit status."""
 
 from __future__ import annotations
 
 import re
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,7 +14,6 @@ from rich.progress import BarColumn
 
 from catstream.base.text import counted
 from catstream.cli.common import (
-    complain,
     line_of,
     messages,
     screen,
@@ -24,6 +25,7 @@ from catstream.cli.common import (
     write_json,
 )
 from catstream.cli.options import NumberRange, with_settings
+from catstream.errors import BoxError, CatstreamError, ObjectError, SettingsError, VideoError
 
 if TYPE_CHECKING:
     from catstream.measure.load_result import Limit, Result
@@ -38,7 +40,27 @@ def _size(_: click.Context, __: click.Parameter, text: str) -> tuple[int, int]:
     return size
 
 
-@click.command()
+class _LoadTest(click.Command):
+    """Exits with 2 if the arguments are invalid, because 1 states that the load was not sustained."""
+
+    def make_context(self, *arguments: Any, **options: Any) -> click.Context:
+        with _usage_errors(CatstreamError):
+            return super().make_context(*arguments, **options)
+
+    def invoke(self, context: click.Context) -> Any:
+        with _usage_errors(SettingsError, BoxError, ObjectError, VideoError):
+            return super().invoke(context)
+
+
+@contextmanager
+def _usage_errors(*kinds: type[CatstreamError]) -> Iterator[None]:
+    try:
+        yield
+    except kinds as error:
+        raise click.UsageError(str(error)) from None
+
+
+@click.command(cls=_LoadTest)
 @click.option("--streams", type=click.IntRange(1, 64), default=1, show_default=True, help="Number of pipelines.")
 @click.option("--objects", type=click.IntRange(1, 16), default=1, show_default=True, help="Objects of each pipeline.")
 @click.option(
@@ -55,6 +77,7 @@ def _size(_: click.Context, __: click.Parameter, text: str) -> tuple[int, int]:
 @click.option(
     "--source", type=click.Choice(["mjpeg", "h264"]), default="mjpeg", show_default=True, help="Over HTTP or RTSP."
 )
+@click.option("--warm-up", is_flag=True, help="Measure the training of the first models as well.")
 @click.option("--find-streams", is_flag=True, help="Search for the highest number of streams that meets the limits.")
 @click.option("--limit", "limits", multiple=True, metavar="NAME=VALUE", help="Limit to meet, see above; repeatable.")
 @with_json_file
@@ -83,10 +106,11 @@ def loadtest(
       missed                    share of frames whose tracks fast subscribers missed, at most
       success                   share of frames with an IoU above 0.5, at least
 
-    With --find-streams, the load test searches for the number of cameras that
-    this machine can serve: it starts with STREAMS, each step takes DURATION, and
-    the default limits are p99=0.1 and skipped=0. The exit status is 1 if a limit
-    was exceeded or a stream failed.
+    Without --limit, the limits are p99=0.1 and skipped=0, or skipped=0.01 with
+    --warm-up. The last line is the verdict. The exit status is 0 if the load was
+    sustained (no stream failed, and all limits are met), 1 if it was not, and 2
+    if the arguments are invalid. With --find-streams, the load test searches for
+    the number of cameras that this machine can serve, starting with STREAMS.
 
     \b
     EXAMPLES
@@ -95,12 +119,12 @@ def loadtest(
       catstream loadtest --streams 4 --subscribers 50 --slow-subscribers 5 --report load.html
       catstream loadtest --find-streams --rate 25 --size 1920x1080
     """
-    from catstream.measure.load_report import answer, milliseconds, to_json, write_report
+    from catstream.measure.load_report import milliseconds, to_json, verdict, write_report
     from catstream.measure.load_result import Limit, Plan, violations
     from catstream.measure.load_test import run_load_test
 
-    parsed = [Limit.parse(text) for text in limits or (("p99=0.1", "skipped=0") if find_streams else ())]
     parameters = Plan(**plan)
+    parsed = [*map(Limit.parse, limits)] or Limit.defaults(parameters)
     with line_of(
         messages(), text("{task.description}"), BarColumn(24), text("{task.fields[figures]}", last=True)
     ) as progress:
@@ -122,18 +146,14 @@ def loadtest(
     for streams, reason in load_test.refused.items():
         click.echo(f"{streams} streams did not start: {reason}")
     if load_test.results:
-        if find_streams:
-            click.echo(f"{answer(load_test)}.")
         _print_run(load_test.result, parsed)
         write_json(json_file, to_json(load_test))
         if report_file is not None:
             click.echo(f"report: {write_report(report_file, load_test)}")
+        click.echo(verdict(load_test))
     if load_test.interrupted:
         stopped("these are the results so far" if load_test.results else "there are no measurements yet")
-    for line in load_test.violations:
-        complain(f"limit exceeded: {line}")
-    if load_test.violations:
-        sys.exit(1)
+    sys.exit(0 if load_test.sustained else 1)
 
 
 def _print_run(result: Result, limits: list[Limit]) -> None:
@@ -153,5 +173,5 @@ def _print_run(result: Result, limits: list[Limit]) -> None:
             f"other processes kept {result.other_load:.1f} cores busy: repeat on an idle machine for reliable results"
         )
     for limit in limits:
-        if limit.is_met(result):  # the others are an error
-            click.echo(f"{click.style('met', 'green')}: {limit.describe(result)}")
+        met = click.style("met", "green") if limit.is_met(result) else click.style("not met", "red")
+        click.echo(f"{met}: {limit.describe(result)}")

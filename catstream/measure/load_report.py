@@ -10,13 +10,10 @@ from statistics import fmean
 from typing import NamedTuple
 
 from catstream.base.arrays import Float64
-from catstream.base.text import counted
 from catstream.measure.latency import PERCENTILES, percentiles
 from catstream.measure.load_result import Result, violations
 from catstream.measure.load_test import MOST_STREAMS, LoadTest
 from catstream.output.report import write_page
-
-_SUSTAINED = 0.01  # share of skipped frames up to which a rate counts as sustained
 
 
 class Table(NamedTuple):
@@ -128,7 +125,9 @@ def to_json(load_test: LoadTest) -> dict[str, object]:
         "subscribers": {"received": result.received, "missed": result.missed},
         "camera_late": round(result.camera_late, 6),
         "limits": {limit.name: {"value": limit.value, "met": limit.is_met(result)} for limit in load_test.limits},
-        "violations": load_test.violations,
+        "sustained": load_test.sustained,
+        "verdict": verdict(load_test),
+        "violations": violations(load_test.limits, result),
         "highest_streams": load_test.highest,
         "steps": [
             {
@@ -146,7 +145,7 @@ def to_json(load_test: LoadTest) -> dict[str, object]:
 def write_report(path: Path, load_test: LoadTest) -> Path:
     """Write the report of the decisive run, and of the steps of a search."""
     result = load_test.result
-    verdicts = [(f"{answer(load_test)}.", load_test.highest is not None) if load_test.find else _verdict(result)]
+    verdicts = [(verdict(load_test), load_test.sustained is not False)]
     verdicts += [(error, False) for error in result.errors]
     verdicts += [(limit.describe(result), limit.is_met(result)) for limit in load_test.limits]
     return write_page(
@@ -164,27 +163,18 @@ def write_report(path: Path, load_test: LoadTest) -> Path:
     )
 
 
-def _verdict(result: Result) -> tuple[str, bool]:
-    """A sentence: every stream was tracked at its rate, or where and when most frames were skipped."""
-    number, worst = max(enumerate(result.streams), key=lambda stream: stream[1].skipped)
-    rate = f"{counted(len(result.streams), 'stream')} of {result.plan.rate:g} frames/s"
-    if worst.skipped <= _SUSTAINED:
-        return f"Sustained: {rate}, at most {100 * worst.skipped:.1f} % of the frames skipped.", True
-    since = worst.due[~worst.tracked][0] - worst.due[0]
-    return (
-        f"Not sustained: of {rate}, stream {number} skipped {100 * worst.skipped:.1f} % of its frames, the first after "
-        f"{since:.1f} s: it was tracked at {result.rate(worst.skipped):.1f} frames/s."
-    ), False
-
-
-def answer(load_test: LoadTest) -> str:
-    """How many streams this machine serves, and what a stream costs."""
-    if load_test.highest is None:
-        return "Interrupted: no answer yet" if load_test.interrupted else "No number of streams meets the limits"
-    (cores, memory), most = load_test.result.mean_cost, "at least " * (load_test.highest == MOST_STREAMS)
-    return (
-        f"This machine serves {most}{load_test.result.plan}; a stream takes {cores:.2f} cores and {memory / 1e6:.0f} MB"
-    )
+def verdict(load_test: LoadTest) -> str:
+    """State in one sentence whether the load was sustained, or the highest number of streams that was."""
+    result, reasons = load_test.result, "; ".join(violations(load_test.limits, load_test.result))
+    if load_test.find and not (reasons or result.interrupted):
+        (cores, memory), plan = result.mean_cost, result.plan
+        is_least = load_test.interrupted or plan.streams == MOST_STREAMS
+        start = "Interrupted" if load_test.interrupted else "Sustained"
+        most = "at least" if is_least else "at most"
+        return f"{start}: {most} {plan}; a stream takes {cores:.2f} cores and {memory / 1e6:.0f} MB."
+    if load_test.interrupted:
+        return f"Interrupted after {result.seconds:.1f} s: no verdict on {result.plan}."
+    return f"Not sustained: {result.plan}: {reasons}." if reasons else f"Sustained: {result.plan}."
 
 
 def _steps(load_test: LoadTest) -> Table:

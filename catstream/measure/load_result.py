@@ -42,6 +42,7 @@ class Plan:
     duration          seconds
     size              (width, height) of a frame in pixels
     source            "mjpeg" (over HTTP) or "h264" (over RTSP)
+    warm_up           whether the training of the first models is measured as well
     settings          settings of all pipelines
     """
 
@@ -53,6 +54,7 @@ class Plan:
     duration: float = 10.0
     size: tuple[int, int] = rendered.SIZE
     source: str = "mjpeg"
+    warm_up: bool = False
     settings: Settings = field(default_factory=Settings)
 
     def __post_init__(self) -> None:
@@ -173,8 +175,10 @@ class Limit:
             )
         return cls(name, value)
 
-    def __str__(self) -> str:
-        return f"{self.name}={self.value:g}"
+    @classmethod
+    def defaults(cls, plan: Plan) -> list[Limit]:
+        """Return the limits of a load test without any: p99 of 0.1 s, no skipped frame (1 % with the warm-up)."""
+        return [cls("p99", 0.1), cls("skipped", 0.01 if plan.warm_up else 0.0)]
 
     def is_met(self, result: Result) -> bool:
         value = result.worst[self.name]

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 from os import getpid
 from time import monotonic
 
-from catstream.errors import ServiceError
+from catstream.errors import ServiceError, errors_in
 from catstream.measure.camera import Camera, Schedule
 from catstream.measure.latency import Observations, Usage, measure, observed, proportional_memory
 from catstream.measure.load import Stream, Subscribers, Video, render
@@ -91,7 +91,8 @@ def _started(
             time.sleep(_LOOP_SECONDS)
         for stream in streams:
             if stream.error is not None:
-                raise stream.error
+                with errors_in(f"stream {stream.number}", ServiceError):
+                    raise stream.error
 
     stack.callback(_stop, streams)
     for stream in streams:
@@ -99,7 +100,10 @@ def _started(
     wait_until(lambda: all(stream.ready.is_set() for stream in streams), "starting processes")
     addresses = [stream.address for stream in streams if stream.address is not None]
     observations = stack.enter_context(observed(addresses, name))
-    wait_until(lambda: all(stream.warmed_up for stream in observations), "learning the first models")
+    if plan.warm_up:
+        wait_until(lambda: all(stream.tracks for stream in observations), "waiting for the first tracks")
+    else:
+        wait_until(lambda: all(stream.warmed_up for stream in observations), "learning the first models")
     groups = [Subscribers(address, plan.subscribers, plan.slow_subscribers) for address in addresses]
     for group in groups:
         stack.enter_context(group)
@@ -156,18 +160,13 @@ class LoadTest:
     @property
     def result(self) -> Result:
         """The decisive run: the one with the most streams that meets the limits, or the last one if none does."""
-        passed = [result for result in self.results if not violations(self.limits, result)]
+        passed = [result for result in self.results if not (result.interrupted or violations(self.limits, result))]
         return max(passed, key=lambda result: result.plan.streams, default=self.results[-1])
 
     @property
-    def violations(self) -> list[str]:
-        """The reasons why the load test has failed, one line each."""
-        if not self.find:
-            return [line for result in self.results for line in violations(self.limits, result)]
-        if self.highest is None and not self.interrupted:
-            lowest = self.results[-1].plan.streams
-            return [f"no number of streams meets {', '.join(map(str, self.limits))}: the lowest tried was {lowest}"]
-        return []
+    def sustained(self) -> bool | None:
+        """True if no stream of the decisive run failed and it meets all limits; None if it was interrupted."""
+        return None if self.interrupted else not violations(self.limits, self.result)
 
 
 def run_load_test(

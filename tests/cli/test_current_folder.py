@@ -49,7 +49,7 @@ def test_no_file_in_the_current_folder_is_imported(name, walk, traps, tmp_path):
     (tmp_path / "program.py").write_text(PROGRAM)
     images, out = walk / "img", tmp_path / "out"
     box = (walk / "groundtruth_rect.txt").read_text().splitlines()[0]
-    load = ["--rate", "20", "--duration", "1", "--size", "160x120", "--subscribers", "1"]
+    load = ["--rate", "20", "--duration", "1", "--size", "160x120", "--subscribers", "1", "--limit", "skipped=1"]
     command = {
         "track": [CATSTREAM, "track", images, "--box", box, "--output", out],
         "evaluate": [CATSTREAM, "evaluate", walk, "--jobs", "2", "--json", tmp_path / "x.json"],

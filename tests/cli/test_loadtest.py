@@ -1,4 +1,4 @@
-"""`catstream loadtest`: a real run, its figures in three forms, and an exit code that says whether it held."""
+"""`catstream loadtest`: a real run, its figures in three forms, and an exit status that is the verdict."""
 
 import json
 import re
@@ -13,12 +13,15 @@ def test_run_counts_every_frame_and_prints_the_violated_limit(said, tmp_path):
         "loadtest", *arguments, *limits, "--report", "load.html", "--json", "x.json", cwd=tmp_path
     )
     assert code == 1
-    broken = r"catstream: limit exceeded: max is .*, limit at most 0 ms \(from a frame to its track\)"
-    assert re.fullmatch(broken, errors.splitlines()[-1])
+    assert errors == ""
+    assert re.search(r"^not met: max is .*, limit at most 0 ms \(from a frame to its track\)$", output, re.MULTILINE)
+    last = r"Not sustained: 1 stream of 320x240 pixels \(mjpeg\), 20 frames/s due in each: max is .*\."
+    assert re.fullmatch(last, output.splitlines()[-1])
     assert re.search(r"^0 +\d+\.\d +\d+\.\d %", output, re.MULTILINE)
-    assert "met: missed" in output
+    assert "\nmet: missed" in output
 
     figures = json.loads((tmp_path / "x.json").read_text())
+    assert (figures["sustained"], figures["verdict"]) == (False, output.splitlines()[-1])
     (stream,) = figures["streams"]
     assert stream["frames"] == 60
     assert stream["frames_per_second"] == pytest.approx(20 * (1 - stream["skipped"]))
@@ -42,7 +45,10 @@ def test_run_counts_every_frame_and_prints_the_violated_limit(said, tmp_path):
         (["--limit", "p98=1"], "a limit is NAME=VALUE with one of p50"),
         (["--report", "/dev/null/load.html"], "cannot write"),
         (["--set", "run.lockstep=true"], "omit run.lockstep"),
+        (["--set", "run.nothing=1"], "run.nothing"),
     ],
 )
-def test_contradictory_options_are_errors_before_the_start(fail, tmp_path, arguments, message):
-    assert message in fail("loadtest", *arguments, cwd=tmp_path)
+def test_invalid_arguments_are_usage_errors_before_the_start(fail, tmp_path, arguments, message):
+    error = fail("loadtest", *arguments, cwd=tmp_path)
+    assert message in error
+    assert error.startswith("Error: "), "the exit status 1 would mean that the load was not sustained"

@@ -2,9 +2,7 @@
 
 import json
 
-import pytest
-
-from catstream.measure.load_report import to_json, write_report
+from catstream.measure.load_report import to_json, verdict, write_report
 from catstream.measure.load_result import Limit
 from catstream.measure.load_test import LoadTest
 
@@ -12,29 +10,32 @@ from catstream.measure.load_test import LoadTest
 def test_a_search_shows_the_number_of_streams_and_the_steps(result, tmp_path):
     runs = [result(*[[seconds] * 50] * streams) for streams, seconds in ((1, 0.01), (4, 0.3), (2, 0.02))]
     load_test = LoadTest([Limit("p99", 0.1)], find=True, results=runs, highest=2)
-    assert (load_test.result.plan.streams, load_test.violations) == (2, [])
+    assert (load_test.result.plan.streams, load_test.sustained) == (2, True)
     page = write_report(tmp_path / "report.html", load_test).read_text()
-    assert "This machine serves 2 streams" in page
+    assert "Sustained: at most 2 streams" in page
     assert (page.count(">met<"), page.count(">exceeded<")) == (2, 1)
     steps = to_json(load_test)["steps"]
     assert [(step["streams"], step["p99"]) for step in steps] == [(1, 0.01), (4, 0.3), (2, 0.02)]
     load_test = LoadTest([Limit("p99", 0.1)], find=True, results=runs[1:2])
-    assert load_test.violations == ["no number of streams meets p99=0.1: the lowest tried was 4"]
-    assert "No number of streams meets the limits" in write_report(tmp_path / "report.html", load_test).read_text()
+    assert "Not sustained: 4 streams" in write_report(tmp_path / "report.html", load_test).read_text()
 
 
-@pytest.mark.parametrize(
-    ("tracked", "told"),
-    [
-        (1.0, "Sustained: 2 streams of 25 frames/s, at most 0.0 %"),
-        (0.8, "stream 0 skipped 20.0 % of its frames, the first after 4.0 s"),
-    ],
-)
-def test_report_begins_with_whether_the_rate_was_sustained(result, tmp_path, tracked, told):
-    run = result([0.01] * 50, [0.01] * 50, tracked=tracked)
-    page = write_report(tmp_path / "report.html", LoadTest([], results=[run])).read_text()
-    assert told in page
-    assert page.index("ustained") < page.index("<h2>Streams</h2>")
+def test_verdict_is_the_first_line_of_the_report_and_in_json(result, tmp_path):
+    for tracked, told in ((1.0, "Sustained: 2 streams"), (0.8, "Not sustained: 2 streams")):
+        run = result([0.01] * 50, [0.01] * 50, tracked=tracked)
+        load_test = LoadTest(Limit.defaults(run.plan), results=[run])
+        assert verdict(load_test).startswith(told)
+        assert to_json(load_test)["sustained"] == (tracked == 1)
+        page = write_report(tmp_path / "report.html", load_test).read_text()
+        assert page.index(verdict(load_test)) < page.index("<h2>Streams</h2>")
+
+
+def test_interrupted_search_says_at_least(result):
+    runs = [result([0.01] * 50), result(*[[0.01] * 50] * 2, interrupted=True)]
+    load_test = LoadTest([Limit("p99", 0.1)], find=True, results=runs, interrupted=True)
+    assert verdict(load_test).startswith("Interrupted: at least 1 stream of")
+    load_test.results.pop(0)
+    assert verdict(load_test).startswith("Interrupted after 10.0 s: no verdict")
 
 
 def test_every_stream_and_process_has_its_row(result, tmp_path):
