@@ -154,6 +154,6 @@ def test_all_frames_and_their_times_are_those_that_ffmpeg_says(tmp_path, picture
 
 
 def test_the_table_of_the_how_to_lists_what_is_compared():
-    page = Path(__file__).parents[2] / "docs" / "how-to" / "inputs.md"
+    page = Path(__file__).parents[2] / "docs" / "how-to" / "sources.md"
     rows = dict(re.findall(r"^\.(\w+) +(.+)$", page.read_text(), re.MULTILINE))
     assert rows == {container: codecs.replace(" ", ", ") for container, (codecs, _) in CONTAINERS.items()}
