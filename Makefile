@@ -65,7 +65,7 @@ format: $(TOOLS)  ## fix the style automatically
 	$(BIN)/ruff format .
 
 docs: $(TOOLS)  ## the documentation, into site/
-	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 wheel:  ## build sdist and wheel in dist/, and try them on each supported Python of this machine: some minutes
 	@PYTHON=$(PYTHON) .ci/wheel

@@ -1,4 +1,4 @@
-"""Hook of MkDocs: adds the commands, the settings and the list of pages to the documentation."""
+"""Hook of MkDocs: adds the commands, the settings and the pages outside `docs/` to the documentation."""
 
 from __future__ import annotations
 
@@ -10,25 +10,37 @@ from pathlib import Path
 from typing import Any
 
 import click
+from mkdocs.structure.files import File, Files
 
 from catstream.base.settings import PRESETS, RESUMABLE, describe
 from catstream.cli import COMMANDS, load_command
 
-README = Path(__file__).parents[1] / "README.md"
+ROOT = Path(__file__).parents[1]
+#: Pages outside `docs/`, and their places in the built site.
+OUTSIDE = {"README.md": "index.md"} | {
+    name: name
+    for name in ("CHANGELOG.md", "CONTRIBUTING.md", "SECURITY.md", "benchmarks/README.md", "benchmarks/parameters.md")
+}
+
+
+def on_files(files: Files, config: Any) -> Files:
+    """Add the pages outside `docs/` to the site; README is its first page."""
+    for path, page in OUTSIDE.items():
+        text = (ROOT / path).read_text(encoding="utf-8")
+        files.append(File.generated(config, page, content=text))
+    return files
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
-    """Append the help of all commands, the settings, or the list of pages to their page."""
-    pages = {"command-line.md": commands, "settings.md": settings, "index.md": index}
-    added = pages.get(page.file.src_uri)
+    """Append the help of all commands, or the settings, to their page, and adapt links to pages outside `docs/`."""
+    place = page.file.src_uri
+    if place in OUTSIDE.values():
+        return re.sub(r"\]\(((?:\.\./)*)docs/", r"](\1", markdown)
+    outside = "../" * (place.count("/") + 1)  # from the page to the root of the repository
+    markdown = markdown.replace(f"]({outside}", f"]({outside.removeprefix('../')}").replace("](README.md", "](index.md")
+    pages = {"command-line.md": commands, "settings.md": settings}
+    added = pages.get(place)
     return f"{markdown}\n{added()}" if added else markdown
-
-
-def index() -> str:
-    """Return the table of the pages from README, with links as they are in the folder of the documentation."""
-    _, heading, section = README.read_text(encoding="utf-8").partition("## Documentation\n")
-    table, _, _ = section.strip().partition("\n\n")
-    return re.sub(r"\]\((docs/)?", lambda link: "](" if link[1] else "](../", f"{heading}\n{table}\n")
 
 
 def settings() -> str:

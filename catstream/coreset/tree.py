@@ -32,14 +32,14 @@ class CoresetTree:
     where A are all inserted rows, C is `rows`, and c is `dropped_energy`. If d <= n, C'C is A'A: nothing is dropped.
     While rows are reduced, linear algebra runs on one thread in the whole process: more threads are slower.
 
-    Parameters
-    ----------
-    size : number of rows of a node, n in the paper
-
     >>> tree = CoresetTree(size=4)
     >>> tree.insert(np.eye(13, 5, dtype=np.float32))
     >>> [node.level for node in tree.nodes], len(tree.pending), tree.rows_seen
     ([1, 0], 1, 13)
+
+    Parameters
+    ----------
+    size : number of rows of a node, n in the paper
     """
 
     def __init__(self, size: int) -> None:
