@@ -66,6 +66,15 @@ def _usage_errors(*kinds: type[CatstreamError]) -> Iterator[None]:
 @click.option(
     "--subscribers", type=click.IntRange(0, 1000), default=0, show_default=True, help="Subscribers to each pipeline."
 )
+@click.option(
+    "--channel",
+    "channels",
+    type=click.Choice(["tracks", "models", "samples", "previews", "features"]),
+    multiple=True,
+    default=["tracks"],
+    show_default=True,
+    help="Channel of the subscribers; repeatable.",
+)
 @click.option("--slow-subscribers", type=click.IntRange(0), default=0, help="Number of slow subscribers among them.")
 @click.option(
     "--rate", type=NumberRange(0.5, 1000), default=25.0, show_default=True, help="Frames per second of each stream."
@@ -103,7 +112,8 @@ def loadtest(
       p50 p95 p99 p99.9 max     seconds from a frame to its track, at most
       model-p50 ... model-max   seconds from a frame to the model trained on it, at most
       skipped                   share of frames that were not tracked, at most
-      missed                    share of frames whose tracks fast subscribers missed, at most
+      subscriber-p50 ... -max   seconds from a frame to its receipt by fast subscribers, at most
+      subscriber-missed         share of frames that fast subscribers missed, at most
       success                   share of frames with an IoU above 0.5, at least
 
     Without --limit, the limits are p99=0.1 and skipped=0, or skipped=0.01 with
@@ -116,7 +126,7 @@ def loadtest(
     EXAMPLES
       catstream loadtest --rate 30 --limit p99=0.1
       catstream loadtest --objects 8 --limit skipped=0.01
-      catstream loadtest --streams 4 --subscribers 50 --slow-subscribers 5 --report load.html
+      catstream loadtest --subscribers 500 --limit subscriber-p99=0.05 --report load.html
       catstream loadtest --find-streams --rate 25 --size 1920x1080
     """
     from catstream.measure.load_report import milliseconds, to_json, verdict, write_report

@@ -18,6 +18,9 @@ from socketserver import StreamRequestHandler, ThreadingTCPServer
 from time import monotonic
 from typing import Any, Self
 
+import numpy as np
+
+from catstream.base.arrays import Float64
 from catstream.base.workers import SPAWN, die_with, sigint_blocked
 from catstream.errors import ServiceError
 from catstream.measure.mjpeg import MjpegConnection
@@ -43,6 +46,10 @@ class Schedule:
 
     def due(self, number: int) -> float:
         return self.start + number / self.rate
+
+    def due_times(self, frames: int) -> Float64:
+        """Return the due times of so many frames, float64 (frames,)."""
+        return self.start + np.arange(frames) / self.rate
 
     def number(self, moment: float) -> int:
         """Return the frame whose due time is nearest to a moment."""

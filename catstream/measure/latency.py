@@ -135,6 +135,32 @@ class Measures:
         return {**percentiles(self.track), **model, "skipped": self.skipped, "success": self.success}
 
 
+@dataclass(slots=True)
+class Receipts:
+    """The measures of the fast subscribers to one channel of a stream.
+
+    latency   seconds from the due time of each frame to the receipt of a message of this frame or a newer one; at most
+              to the end of the run; float32 (subscribers, frames)
+    received  number of frames of which each subscriber has received a message since it connected
+    missed    number of frames of which each subscriber has missed all messages, by the gaps in `frame`; 0 on a channel
+              that keeps only the newest message
+    """
+
+    stream: int
+    channel: str
+    latency: np.ndarray
+    received: list[int]
+    missed: list[int]
+
+    @property
+    def figures(self) -> dict[str, float]:
+        """The figures that can have a limit, by name; none without fast subscribers."""
+        if not self.received:
+            return {}
+        latencies = {f"subscriber-{name}": seconds for name, seconds in percentiles(self.latency).items()}
+        return latencies | {"subscriber-missed": sum(self.missed) / max(1, sum(self.missed) + sum(self.received))}
+
+
 def measure(
     observations: Observations, schedule: Schedule, frames: int, truth: Float64, end: float, totals: dict[str, int]
 ) -> Measures:
@@ -145,7 +171,7 @@ def measure(
     end : time at which the observation ended
     totals : totals of the pipeline at its end
     """
-    due = np.array([schedule.due(number) for number in range(frames)])
+    due = schedule.due_times(frames)
     tracks = [(moment, schedule.number(track.pts or 0.0)) for moment, track in observations.tracks]
     tracked = np.isin(np.arange(frames), [number for _, number in tracks])
     boxes = np.full((frames + 1, 4), np.nan)  # one more, without a box, for the frames before the first tracked one
@@ -166,7 +192,7 @@ def measure(
     )
 
 
-def percentiles(seconds: Float64) -> dict[str, float]:
+def percentiles(seconds: np.ndarray) -> dict[str, float]:
     """Return the `PERCENTILES` of at least one latency; each of them is the latency of a frame.
 
     >>> percentiles(np.array([0.010] * 98 + [0.5, 2.0]))["p99"]
@@ -191,6 +217,11 @@ def latencies_to_answer(due: Float64, answers: list[tuple[float, int]], end: flo
         if number >= 0:
             place = min(number, len(due) - 1)
             first[place] = min(first[place], moment)
+    return latencies(due, first, end)
+
+
+def latencies(due: Float64, first: Float64, end: float) -> Float64:
+    """Return the same from the arrival time of the first answer to each frame, infinite if there is none."""
     first = np.minimum.accumulate(first[::-1])[::-1]
     return np.asarray(np.minimum(first, end) - due)
 

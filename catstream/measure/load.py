@@ -1,13 +1,11 @@
-"""The load: the video that the camera sends, a pipeline for each stream, and its subscribers."""
+"""The load: the video that the camera sends, and a pipeline for each stream."""
 
 from __future__ import annotations
 
-import os
 import threading
-from collections.abc import Iterable, Iterator, MutableSequence
-from contextlib import ExitStack, suppress
-from time import monotonic, sleep
-from typing import Any, NamedTuple, Self, cast
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
+from typing import NamedTuple, cast
 
 import numpy as np
 
@@ -15,7 +13,6 @@ from catstream.base.arrays import Float64
 from catstream.base.box import Box
 from catstream.base.names import UNNAMED
 from catstream.base.settings import Settings
-from catstream.base.workers import SPAWN, die_with, sharing, sigint_blocked
 from catstream.client.address import Address
 from catstream.client.attach import control
 from catstream.errors import CatstreamError, CommandRejectedError, SilenceError
@@ -24,17 +21,10 @@ from catstream.pipeline import Pipeline
 from catstream.video import rendered
 from catstream.video.frames import jpeg
 from catstream.video.writer import Encoder
-from catstream.wire.channels import TRACKS
-from catstream.wire.messages import End
-from catstream.wire.newest import GapCounter, Subscriber
 
 _QUALITY = 90  # of JPEG, as network cameras use it
 _STILL_FRAMES = 24  # of which the first is a keyframe
 _STOP_SECONDS = 30.0  # timeout for a pipeline to start, to answer `stop`, and to end after it
-_PER_PROCESS = 20  # subscribers in one process, because most machines cannot run a process for each
-#: Maximum number of messages that a subscriber reads at once, and seconds between two reads.
-_QUICK, _SLOW = (64, 0.05), (1, 0.5)
-_DRAIN_SECONDS = 20.0  # timeout for fast subscribers to receive the last messages
 
 
 class Video(NamedTuple):
@@ -139,96 +129,3 @@ class Stream(threading.Thread):
     def join(self, timeout: float | None = _STOP_SECONDS) -> None:
         """Wait until the pipeline has ended, which may take some seconds."""
         super().join(timeout)
-
-
-class Subscribers:
-    """Subscribers to the tracks of one pipeline; a context manager.
-
-    They run with idle priority, and the fast ones read twenty times per second, so that they take little processor time
-    from the pipeline. `slow` of the `readers` read two messages per second.
-
-    received, missed : number of frames whose tracks each of the fast subscribers has received, and missed by the gaps
-        in `frame`
-    """
-
-    def __init__(self, address: Address, readers: int, slow: int) -> None:
-        self._quick, self._readers = readers - slow, readers
-        with sharing():
-            self._received, self._missed = (SPAWN.RawArray("l", max(readers, 1)) for _ in range(2))
-
-        def processes(numbers: range, pace: tuple[int, float]) -> list[Any]:
-            parts = [numbers[begin : begin + _PER_PROCESS] for begin in range(0, len(numbers), _PER_PROCESS)]
-            rest = pace, self._received, self._missed, os.getpid()
-            return [SPAWN.Process(target=_read_until_end, args=(address, part, *rest), daemon=True) for part in parts]
-
-        self._fast = processes(range(self._quick), _QUICK)
-        self._all = [*self._fast, *processes(range(self._quick, readers), _SLOW)]
-
-    @property
-    def pids(self) -> list[int]:
-        return [process.pid for process in self._all]
-
-    @property
-    def connected(self) -> bool:
-        """True if each subscriber has received a track."""
-        return all(self._received[: self._readers])
-
-    @property
-    def received(self) -> list[int]:
-        return list(self._received[: self._quick])
-
-    @property
-    def missed(self) -> list[int]:
-        return list(self._missed[: self._quick])
-
-    def wait(self) -> None:
-        """Wait until each fast subscriber has received the end, with a timeout."""
-        deadline = monotonic() + _DRAIN_SECONDS
-        for process in self._fast:
-            process.join(max(0.0, deadline - monotonic()))
-
-    def __enter__(self) -> Self:
-        with sigint_blocked():
-            for process in self._all:
-                process.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        for process in self._all:
-            process.kill()
-            process.join()
-
-
-def _read_until_end(
-    address: Address,
-    numbers: range,
-    pace: tuple[int, float],
-    received: MutableSequence[int],
-    missed: MutableSequence[int],
-    parent: int,
-) -> None:
-    """Run some of the subscribers until the pipeline ends."""
-    die_with(parent)
-    os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
-    with ExitStack() as stack:
-        endpoint = address.resolve()
-        readers = {number: stack.enter_context(Subscriber(TRACKS, endpoint)) for number in numbers}
-        gaps = {number: GapCounter() for number in numbers}
-        last = dict.fromkeys(numbers, 0)  # number of the last frame: the tracks of all objects in it have the same
-        most, pause = pace
-        while readers:
-            for number, reader in list(readers.items()):
-                for _ in range(most):
-                    if (message := reader.receive(0)) is None:
-                        break
-                    if isinstance(message, End):
-                        gaps[number].end(message)
-                        del readers[number]
-                    else:
-                        gaps[number].take(message)
-                        received[number] += message.seq != last[number]
-                        last[number] = message.seq
-                    missed[number] = gaps[number].missed
-                    if number not in readers:
-                        break
-            sleep(pause)

@@ -62,23 +62,31 @@ def tables(result: Result) -> Iterator[Table]:
             for name, readings in result.usage.items()
         ]
         yield Table("Processes", processes, "MB: as above (PSS), at the end of the run.")
-    if result.plan.subscribers:
-        subscribers = {
-            "of each stream": result.plan.subscribers,
-            "slow": result.plan.slow_subscribers,
-            "received, least": min(result.received, default=0),
-            "received, most": max(result.received, default=0),
-            "missed": sum(result.missed),
-            "missed, most": max(result.missed, default=0),
-        }
+    if result.subscribers:
+        subscribers = [
+            {
+                "channel": receipts.channel,
+                "stream": str(receipts.stream),
+                "fast": str(len(receipts.received)),
+                "slow": str(result.plan.slow_subscribers),
+                **{name: milliseconds(receipts.figures.get(f"subscriber-{name}")) for name in PERCENTILES},
+                "p99, slowest": milliseconds(max((percentiles(row)["p99"] for row in receipts.latency), default=None)),
+                "missed": str(sum(receipts.missed)),
+                "missed, most": str(max(receipts.missed, default=0)),
+            }
+            for receipts in result.subscribers
+        ]
         yield Table(
             "Subscribers",
-            [{head: str(number) for head, number in subscribers.items()}],
-            "Frames whose tracks each of the fast subscribers received, and frames that they missed in total.",
+            subscribers,
+            "Milliseconds from the due time of a frame to its receipt by a fast subscriber, and the p99 of the slowest "
+            "one. Missed: frames whose messages were lost, of all subscribers together, and at most of one.",
         )
 
 
-def milliseconds(seconds: float) -> str:
+def milliseconds(seconds: float | None) -> str:
+    if seconds is None:
+        return "-"
     return f"{1000 * seconds:.3g}" if seconds < 1 else f"{1000 * seconds:.0f}"
 
 
@@ -122,7 +130,13 @@ def to_json(load_test: LoadTest) -> dict[str, object]:
             name: {"cores": fmean(readings), "memory": result.memory.get(name)}
             for name, readings in result.usage.items()
         },
-        "subscribers": {"received": result.received, "missed": result.missed},
+        "subscribers": [
+            {
+                **{name: getattr(receipts, name) for name in ("stream", "channel", "received", "missed")},
+                "latency": percentiles(receipts.latency) if receipts.received else {},
+            }
+            for receipts in result.subscribers
+        ],
         "camera_late": round(result.camera_late, 6),
         "limits": {limit.name: {"value": limit.value, "met": limit.is_met(result)} for limit in load_test.limits},
         "sustained": load_test.sustained,

@@ -13,7 +13,7 @@ from catstream.base.names import check_count
 from catstream.base.settings import Settings
 from catstream.base.text import counted
 from catstream.errors import SettingsError
-from catstream.measure.latency import PERCENTILES, REST, Measures
+from catstream.measure.latency import PERCENTILES, REST, Measures, Receipts
 from catstream.video import rendered
 
 #: The figures that can have a limit, by name. If there are several streams, the worst one counts.
@@ -21,10 +21,11 @@ KINDS = {
     **dict.fromkeys(PERCENTILES, "from a frame to its track"),
     **{f"model-{name}": "from a frame to the model trained on it" for name in PERCENTILES},
     "skipped": "share of frames that were not tracked",
-    "missed": "share of frames whose tracks fast subscribers missed",
+    **{f"subscriber-{name}": "from a frame to its receipt by fast subscribers" for name in PERCENTILES},
+    "subscriber-missed": "share of frames that fast subscribers missed",
     "success": "share of frames with an IoU above 0.5",
 }
-_SHARES = ("skipped", "missed", "success")  # the other figures are times
+_SHARES = ("skipped", "subscriber-missed", "success")  # the other figures are times
 
 #: Is called about ten times a second with the current activity, the share of it that is done, and current figures.
 Report = Callable[[str, float, str], None]
@@ -36,8 +37,9 @@ class Plan:
 
     streams           number of pipelines, each of three processes
     objects           number of objects that each pipeline tracks
-    subscribers       number of subscribers to the tracks of each stream
+    subscribers       number of subscribers to each of the channels of each stream
     slow_subscribers  number of slow ones among them
+    channels          channels of the subscribers
     rate              frames per second of each stream, whether or not the pipeline keeps up
     duration          seconds
     size              (width, height) of a frame in pixels
@@ -50,6 +52,7 @@ class Plan:
     objects: int = 1
     subscribers: int = 0
     slow_subscribers: int = 0
+    channels: tuple[str, ...] = ("tracks",)
     rate: float = 25.0
     duration: float = 10.0
     size: tuple[int, int] = rendered.SIZE
@@ -95,7 +98,7 @@ class Result:
     seconds      duration of the measured frames: less than planned if the run was interrupted
     streams      measures of each stream
     usage        readings of the busy cores of each process, and of the processes outside the load test
-    received     number of frames whose tracks each fast subscriber received; `missed` is the number that it missed
+    subscribers  measures of the fast subscribers to each channel of each stream
     camera_late  largest delay in seconds of a frame that the camera itself caused
     memory       bytes of each process, in which a shared page counts in proportion (PSS)
     errors       errors of failed streams
@@ -106,8 +109,7 @@ class Result:
     seconds: float
     streams: list[Measures]
     usage: dict[str, list[float]]
-    received: list[int]
-    missed: list[int]
+    subscribers: list[Receipts]
     camera_late: float
     memory: dict[str, int] = field(default_factory=dict)
     errors: list[str] = field(default_factory=list)
@@ -115,10 +117,12 @@ class Result:
 
     @property
     def worst(self) -> dict[str, float]:
-        """The value of each of the `KINDS`."""
-        streams = [stream.figures for stream in self.streams]
-        worst = {name: (min if name == "success" else max)(stream[name] for stream in streams) for name in streams[0]}
-        return worst | {"missed": sum(self.missed) / max(1, sum(self.missed) + sum(self.received))}
+        """The value of each of the `KINDS`; without fast subscribers, theirs are 0."""
+        worst = dict.fromkeys(KINDS, 0.0) | {"success": 1.0}
+        for figures in [stream.figures for stream in self.streams] + [each.figures for each in self.subscribers]:
+            for name, value in figures.items():
+                worst[name] = (min if name == "success" else max)(worst[name], value)
+        return worst
 
     @property
     def track(self) -> Float64:

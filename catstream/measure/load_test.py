@@ -12,8 +12,9 @@ from time import monotonic
 from catstream.errors import ServiceError, errors_in
 from catstream.measure.camera import Camera, Schedule
 from catstream.measure.latency import Observations, Usage, measure, observed, proportional_memory
-from catstream.measure.load import Stream, Subscribers, Video, render
+from catstream.measure.load import Stream, Video, render
 from catstream.measure.load_result import Limit, Plan, Report, Result, violations
+from catstream.measure.subscribers import Subscribers
 
 MOST_STREAMS = 64  # of a load test
 _START_TIMEOUT_SECONDS = 120.0  # for each phase of the start
@@ -37,6 +38,8 @@ def run(plan: Plan, video: Video, report: Report) -> Result:
                 pids["subscribers"] = readers
             return pids | {"camera": [camera.pid], "load test": [getpid()]}
 
+        for group in groups:
+            group.begin(observations)
         schedules = camera.play(Schedule(monotonic() + _LEAD_SECONDS + 0.5 / plan.rate, plan.rate))
         try:
             for now in _until_the_last_track(plan, streams, observations, schedules):
@@ -65,8 +68,7 @@ def run(plan: Plan, video: Video, report: Report) -> Result:
             for observation, schedule, number, stream in zip(observations, schedules, due, streams, strict=True)
         ],
         usage=usage.readings,
-        received=[count for group in groups for count in group.received],
-        missed=[count for group in groups for count in group.missed],
+        subscribers=[group.receipts(observations, schedules, due, end) for group in groups],
         camera_late=late,
         memory=memory,
         errors=[f"stream {stream.number}: {stream.error}" for stream in streams if stream.error],
@@ -104,7 +106,11 @@ def _started(
         wait_until(lambda: all(stream.tracks for stream in observations), "waiting for the first tracks")
     else:
         wait_until(lambda: all(stream.warmed_up for stream in observations), "learning the first models")
-    groups = [Subscribers(address, plan.subscribers, plan.slow_subscribers) for address in addresses]
+    groups = [
+        Subscribers(plan, number, channel, address)
+        for number, address in enumerate(addresses if plan.subscribers else ())
+        for channel in plan.channels
+    ]
     for group in groups:
         stack.enter_context(group)
     wait_until(lambda: all(group.connected for group in groups), "attaching subscribers")

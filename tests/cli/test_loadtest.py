@@ -8,7 +8,7 @@ import pytest
 
 def test_run_counts_every_frame_and_prints_the_violated_limit(said, tmp_path):
     arguments = ["--rate", 20, "--duration", 3, "--size", "320x240", "--subscribers", 3, "--slow-subscribers", 2]
-    limits = ["--limit", "max=0", "--limit", "missed=1"]
+    limits = ["--limit", "max=0", "--limit", "subscriber-missed=1"]
     code, output, errors = said(
         "loadtest", *arguments, *limits, "--report", "load.html", "--json", "x.json", cwd=tmp_path
     )
@@ -18,7 +18,7 @@ def test_run_counts_every_frame_and_prints_the_violated_limit(said, tmp_path):
     last = r"Not sustained: 1 stream of 320x240 pixels \(mjpeg\), 20 frames/s due in each: max is .*\."
     assert re.fullmatch(last, output.splitlines()[-1])
     assert re.search(r"^0 +\d+\.\d +\d+\.\d %", output, re.MULTILINE)
-    assert "\nmet: missed" in output
+    assert "\nmet: subscriber-missed" in output
 
     figures = json.loads((tmp_path / "x.json").read_text())
     assert (figures["sustained"], figures["verdict"]) == (False, output.splitlines()[-1])
@@ -29,7 +29,9 @@ def test_run_counts_every_frame_and_prints_the_violated_limit(said, tmp_path):
     assert 0 < stream["track"]["p50"] <= stream["track"]["max"]
     assert 0 < stream["model"]["p50"] <= stream["model"]["max"]
     assert stream["success"] > 0.5
-    assert figures["subscribers"]["received"] != [0]
+    (receipts,) = figures["subscribers"]
+    assert receipts["latency"]["p50"] > 0
+    assert len(receipts["received"]) == 1
     assert {"detector 0", "compressor 0", "trainer 0", "camera", "subscribers"} <= set(figures["processes"])
     assert figures["processes"]["detector 0"]["cores"] > 0
 

@@ -1,5 +1,6 @@
 """Limits and plans, and real runs: pipelines on a camera that does not wait, also if they are ended early."""
 
+import numpy as np
 import psutil
 import pytest
 from hypothesis import given
@@ -8,6 +9,7 @@ from hypothesis import strategies as st
 from catstream.base.settings import Settings
 from catstream.errors import ServiceError, SettingsError
 from catstream.measure import load_test as module
+from catstream.measure.latency import Receipts
 from catstream.measure.load_report import to_json
 from catstream.measure.load_result import Limit, Plan, violations
 from catstream.measure.load_test import find_highest, run_load_test
@@ -109,9 +111,11 @@ def test_default_limits_allow_skipped_frames_only_with_the_warm_up():
 
 
 def test_failed_stream_is_a_violation_beside_missed_frames(result):
-    run = result([0.01] * 10, received=[99, 99], missed=[1, 1], errors=["stream 0: it died"])
-    assert violations([Limit("missed", 0.01)], run) == ["stream 0: it died"]
-    assert "limit at most 0.009" in violations([Limit("missed", 0.009)], run)[1]
+    receipts = Receipts(0, "tracks", np.full((2, 10), 0.02), received=[99, 99], missed=[1, 1])
+    run = result([0.01] * 10, subscribers=[receipts], errors=["stream 0: it died"])
+    assert violations([Limit("subscriber-missed", 0.01), Limit("subscriber-p99", 0.02)], run) == ["stream 0: it died"]
+    assert "limit at most 0.009" in violations([Limit("subscriber-missed", 0.009)], run)[1]
+    assert "subscriber-p99 is 20 ms" in violations([Limit("subscriber-p99", 0.019)], run)[1]
 
 
 @pytest.mark.parametrize("text", ["p98=0.1", "p99", "p99=fast", "p99=-1", "p99=nan"])
