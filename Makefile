@@ -48,7 +48,7 @@ demo: $(READY)  ## render a video, track the object in it, print the accuracy
 test: $(READY) $(TOOLS)  ## all tests but those of test-system and test-slow, with doctests
 	@$(BIN)/pytest -n auto --dist worksteal
 
-test-system: $(READY) $(TOOLS)  ## those with Ray, a browser, Node.js, an RTSP server, or a whole benchmark
+test-system: $(READY) $(TOOLS)  ## those with Ray, a browser, Node.js, or a whole benchmark
 	@$(BIN)/pytest -n 3 --dist worksteal -m 'system and not slow'
 
 test-slow: $(READY) $(TOOLS)  ## the slow ones: many faults, a load test (4 minutes)

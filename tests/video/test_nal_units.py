@@ -1,8 +1,9 @@
-"""H.264 without FFmpeg's parser: fragments are joined, and no frame waits for the next one."""
+"""H.264 over RTSP without FFmpeg's parser: fragments are joined, and no frame waits for the next one."""
 
 import re
 import threading
 from fractions import Fraction
+from itertools import islice
 
 import av
 import numpy as np
@@ -109,6 +110,27 @@ def test_a_camera_whose_fragments_have_several_lengths_is_read_with_the_parser(a
         assert next(source).image.shape == (160, 240, 3)
         assert source._parses
         assert source.reconnects == 0
+
+
+class _Freezing(Broadcast):
+    """Sends three frames on its first connection and then none; on the next one, all."""
+
+    connections = 0
+
+    def frames(self, stream):
+        self.connections += 1
+        yield from islice(super().frames(stream), 3 if self.connections == 1 else None)
+        self._closed.wait()
+
+
+def test_rtsp_camera_that_freezes_is_reconnected(access_units, caplog):
+    with (
+        _Freezing("h264", (240, 160), access_units) as camera,
+        open_source(*camera.urls, read_timeout_seconds=0.5) as source,
+    ):
+        assert [next(source).number for _ in range(6)] == [*range(6)]
+        assert source.reconnects >= 1
+    assert "lost source 0 (no data: check the camera" in caplog.text
 
 
 def shrinking(access_unit):
