@@ -280,6 +280,7 @@ def said():
             for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
                 stack.callback(signal.signal, number, signal.getsignal(number))
             patch.setattr(sys, "argv", ["catstream", *map(str, arguments)])
+            patch.setattr(tempfile, "tempdir", None)  # it is read from TMPDIR again
             patch.setattr(INTERRUPTS, "exit_code", INTERRUPTS.exit_code)
             if cwd is not None:
                 patch.chdir(cwd)

@@ -9,7 +9,6 @@ import signal
 import pytest
 
 from catstream.cli.status import Status
-from catstream.client.attach import control
 from catstream.features.layout import ROW_LENGTH
 from catstream.pipeline import Pipeline
 from catstream.processes.start_server import NAMES
@@ -61,18 +60,6 @@ def test_late_subscriber_gets_the_last_model_with_its_arrays_described(resting, 
     assert model["weights"].keys() == {"dtype", "shape", "norm"}
     assert (model["weights"]["dtype"], model["weights"]["shape"]) == ("float32", [ROW_LENGTH])
     assert (code, errors) == (0, "1 message, 0 missed\n")
-
-
-def test_watch_says_why_nothing_arrives(resting, catstream):
-    with control(resting.endpoint, timeout=SECONDS) as steering:
-        steering.pause()
-        try:
-            process = catstream("watch", "tracks", "--endpoint", resting.endpoint)
-            said = process.stderr.readline()
-        finally:
-            steering.resume()
-    assert said.startswith("waiting: no tracks arrived from")
-    assert said.endswith("the state of the pipeline is: paused\n")
 
 
 def test_ctrl_c_is_no_error(resting, catstream):

@@ -28,17 +28,6 @@ def test_other_formats_are_made_from_the_log_of_a_run(whole_run, video, succeed,
     assert "t.sqlite exists already: replace it with --overwrite" in fail("export", log, tmp_path / "t.sqlite")
 
 
-@pytest.mark.parametrize(
-    ("log", "words"),
-    [("none.csv", "does not exist"), ("a.txt", "is not the log of a run"), ("a.csv", "lacks the column seconds")],
-)
-def test_a_file_that_is_no_log_is_not_exported(fail, tmp_path, log, words):
-    for name in ("a.txt", "a.csv"):
-        (tmp_path / name).write_text("frame\nsomething else\n")
-    assert words in fail("export", tmp_path / log, tmp_path / "t.sqlite")
-    assert not (tmp_path / "t.sqlite").exists()
-
-
 def test_the_labels_of_a_data_set_are_replaced_only_on_request(whole_run, succeed, fail, tmp_path):
     command = ["export", whole_run / "out" / "demo.ndjson", tmp_path / "set", "--format", "yolo"]
     succeed(*command)

@@ -11,6 +11,7 @@ import pytest
 from catstream.base.box import Box
 from catstream.client.saved_model import SavedModel
 from catstream.pipeline import Pipeline
+from catstream.wire.discovery import private_folder, reserve_endpoint
 from tests.learning import learned_from
 
 NEED_A_PIPELINE = [["set-box", "1,2,3,4"], ["search", "one"], ["save", "one"], ["watch", "tracks"]]
@@ -114,6 +115,17 @@ def test_objects_begin_and_are_forgotten_by_name_in_a_paused_run(video, follow, 
 def test_if_no_pipeline_runs_that_is_reported_in_one_line(fail, tmp_path, words):
     nowhere = {"TMPDIR": str(tmp_path), "XDG_RUNTIME_DIR": ""}
     assert fail(*words, env=nowhere).startswith("catstream: no pipeline of yours is running: start one")
+
+
+def test_command_names_the_only_pipeline_that_it_selects(said, commanded):
+    with (
+        private_folder() as own,
+        reserve_endpoint("", own, source="/films/walk.mp4") as place,
+        commanded(place) as heard,
+    ):
+        answer = said("stop")
+    assert answer == (0, "stop was done\n", f"pipeline: /films/walk.mp4 at {place}\n")
+    assert heard == ["stop"]
 
 
 def test_at_an_endpoint_that_a_pipeline_has_left_no_command_is_answered(fail, tmp_path):

@@ -160,16 +160,6 @@ def test_a_port_of_the_page_that_is_in_use_is_an_error_before_the_run(video, fai
     assert not (tmp_path / "state").exists()
 
 
-@pytest.mark.parametrize("output", ["a file", "/proc/catstream"])
-def test_an_output_folder_that_cannot_be_written_is_rejected(video, fail, tmp_path, output):
-    source, box = video
-    folder = tmp_path / "file" if output == "a file" else Path(output)
-    (tmp_path / "file").write_text("mine\n")
-    reason = "is a file" if output == "a file" else "an existing folder that you may write to"
-    assert reason in fail("track", source, "--box", box, "--output", folder)
-    assert (tmp_path / "file").read_text() == "mine\n"
-
-
 def test_a_path_without_permission_is_an_error_of_one_line(said, monkeypatch, tmp_path):
     def denied(*_):
         raise PermissionError(errno.EACCES, "Permission denied", str(tmp_path))
@@ -178,12 +168,6 @@ def test_a_path_without_permission_is_an_error_of_one_line(said, monkeypatch, tm
     code, _, errors = said("evaluate", tmp_path)
     expected = f"cannot use {str(tmp_path)!r} (Permission denied): change its permissions, or use another path"
     assert (code, errors) == (1, f"catstream: {expected}\n")
-
-
-def test_a_model_does_not_replace_the_video_that_is_tracked(video, fail):
-    source, box = video
-    message = fail("track", source, "--box", box, "--save-model", source, "--overwrite")
-    assert f"{source} is the source, which would be lost" in message
 
 
 def test_a_model_that_was_not_saved_before_an_interrupt_is_not_said_to_be(video, said, monkeypatch, tmp_path):

@@ -9,13 +9,12 @@ import pytest
 
 from catstream.client.address import Address
 from catstream.client.registry import Registry
-from catstream.errors import ServiceError, SilenceError
+from catstream.errors import ServiceError
 from catstream.wire.channels import REGISTRY
 from catstream.wire.commands import Responder
 from catstream.wire.discovery import find, fleets, reserve_endpoint, running
 from catstream.wire.keys import Client, Keys, allow, clients, create, synchronise
 from catstream.wire.messages import FleetStatus, Listing, NodeStatus, Question, StreamStatus
-from catstream.wire.rejects import rejected
 
 CAM = StreamStatus("cam-7", "running", "north", "walk.mp4", "run", token=3)
 SITE = FleetStatus("site", 1.7e9, {"cam-7": CAM}, {"north": NodeStatus("north", "alive")})
@@ -79,24 +78,6 @@ def test_an_unknown_host_is_named_before_keys_are_asked_for(monkeypatch):
     monkeypatch.setattr(socket, "getaddrinfo", Mock(side_effect=socket.gaierror))
     with pytest.raises(ServiceError, match="the host 'haed' of the fleet is unknown"):
         Address.parse("fleet://haed:5690/cam-7").resolve()
-
-
-def test_a_stranger_without_a_key_of_the_fleet_gets_no_answer(keys, folder, tcp, managing):
-    address = tcp.removeprefix("tcp://")
-    create(folder / "other")
-    with managing(SITE, tcp, str(keys)):
-        with Registry(address) as registry, pytest.raises(ServiceError, match="requires authentication"):
-            registry.streams()
-        with (
-            Registry(address, str(folder / "other"), timeout=0.5) as registry,
-            pytest.raises(SilenceError, match=r"is its controller running there, with the keys in .*other"),
-        ):
-            registry.streams()
-        before = rejected()
-        (keys / "clients" / "anna").unlink()
-        with Registry(address, str(folder / "anna")) as registry, pytest.raises(ServiceError, match="rejects the key"):
-            registry.streams()
-        assert rejected() > before
 
 
 def test_a_stream_allows_exactly_the_clients_of_its_fleet_and_its_own_processes(keys, folder):

@@ -13,7 +13,6 @@ from catstream.client.address import Address
 from catstream.errors import VideoError
 from catstream.output import events_folder
 from catstream.output.destinations import Origin, SinkOptions, TrackedFrame, check_sink, open_sink
-from catstream.pipeline import Pipeline
 from catstream.wire.channels import PREVIEWS
 from catstream.wire.messages import Preview, Track
 from catstream.wire.newest import Publisher
@@ -91,17 +90,3 @@ def test_each_event_is_a_line_of_json_which_names_its_picture(tmp_path, endpoint
     last = json.loads((tmp_path / "events.ndjson").read_text())
     assert json.loads(first)["picture"] == min(tmp_path.glob("*-found-anna.jpg")).name
     assert (last["event"], last["object"], last["picture"]) == ("ended", "anna", max(tmp_path.glob("2*.jpg")).name)
-
-
-def test_a_sink_writes_the_events_of_a_run_to_a_folder_and_a_webhook_address_is_not_shown(endless, catstream, tmp_path):
-    zone = ("--zone", "all=0,0 320,0 320,240 0,240")
-    hook = "http://me:secret@127.0.0.1:9/T0/secret"
-    with Pipeline(endless, {"flower": "20,20,60,60"}, {"run.unstored_frames": 1}) as pipeline:
-        sink = catstream("sink", f"{tmp_path}/", hook, "--endpoint", pipeline.endpoint, *zone)
-        for _ in pipeline:
-            if len(kinds(tmp_path)) >= 2 or sink.poll() is not None:
-                break
-    errors = sink.communicate(timeout=150)[1]
-    assert kinds(tmp_path)[:2] == ["found-flower", "entered-flower-all"], errors
-    assert "http://127.0.0.1:9/...: no answer" in errors
-    assert "secret" not in errors

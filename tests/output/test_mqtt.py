@@ -8,7 +8,6 @@ import socket
 import subprocess
 import sys
 import threading
-import time
 from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import replace
 
@@ -17,9 +16,8 @@ import pytest
 
 from catstream.base.box import Box
 from catstream.client.address import Address
-from catstream.output import mqtt_sink, remote
+from catstream.output import mqtt_sink
 from catstream.output.destinations import Origin, SinkOptions, TrackedFrame, open_sink
-from catstream.output.track_log import RunFiles
 from catstream.wire.channels import HEALTH
 from catstream.wire.messages import Health, Track
 from catstream.wire.newest import Publisher
@@ -183,23 +181,6 @@ def test_a_lost_source_is_an_event_and_its_objects_are_unknown(broker, until, en
         template = jinja2.Template(config["value_template"])
         assert [template.render(value_json=state) for state in states] == ["ON", "None", "ON"]
         assert template.render(value_json={"present": False, "zones": []}) == template.render() == "OFF"
-
-
-@needs_broker
-def test_the_last_events_are_sent_before_a_slow_delivery(broker, until, tmp_path):
-    broker.start()
-    got = broker.subscriber()
-    with socket.create_server(("127.0.0.1", 0)) as silent:
-        places = [broker.url, f"http://127.0.0.1:{silent.getsockname()[1]}/hook", f"{tmp_path / 'events'}/"]
-        files = RunFiles(Origin(), None, places)
-        with files.opened(str(tmp_path)) as outputs:
-            outputs.write(TrackedFrame([ANNA]))
-            outputs.end()
-            until(lambda: got.get("yard/cam/availability") == ["online", "offline"])
-            assert '"ended"' in (tmp_path / "events" / "events.ndjson").read_text()
-            began = time.monotonic()
-    assert events(got)[-1] == ("ended", 0.0)
-    assert time.monotonic() - began < 2 * remote.CLOSE_SECONDS, "destinations share the time"
 
 
 @needs_broker

@@ -91,23 +91,6 @@ def test_set_box_replaces_the_object_from_its_frame_on_if_processes_die(long_vid
     assert all(track.model_version == 0 or track.model_version > newest for track in after)
 
 
-def test_box_drawn_in_a_past_picture_is_tracked_up_to_now(walker):
-    url, find = walker
-    with (
-        steered(url) as (pipeline, steering, _),
-        subscribe(pipeline.endpoint, "previews", timeout=SECONDS) as pictures,
-    ):
-        drawn = next(pictures)
-        box = find(drawn.jpeg)
-        next(each for each in pictures if not find(each.jpeg).overlap(box))  # it is elsewhere by now
-        answer = steering.set_box(box, time=drawn.time)
-        assert answer.reason.endswith("s before frame 0")
-        shown = next(each for each in pictures if each.boxes)
-        assert shown.boxes[""].overlap(find(shown.jpeg)) > 0.5
-        answer = steering.set_box(find(shown.jpeg), "ben", time=1e-6)
-        assert answer.reason.endswith("as the picture in which it was drawn is not stored any more")
-
-
 def test_paused_live_source_skips_frames(video, camera):
     path, boxes = video
     with open_source(path) as source:

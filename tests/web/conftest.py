@@ -82,11 +82,10 @@ def serve(serve_site, folder):
 
 
 class Fleet:
-    """A fleet of made-up streams and nodes, which a test changes by their names; without keys on this machine."""
+    """A fleet of made-up streams and nodes, which a test changes by their names."""
 
     def __init__(self):
-        self.name = self.address = f"fleet-{uuid4().hex[:12]}"
-        self.listen = self.keys = self.keys_of_client = ""
+        self.name = f"fleet-{uuid4().hex[:12]}"
         self.streams, self.nodes = {}, {}
 
     def stream(self, name, state="running", **more):
@@ -108,14 +107,14 @@ def fleet():
 def manager(fleet, managing):
     """The registry of the fleet, which ends once this is closed."""
     with ExitStack() as stack:
-        stack.enter_context(managing(fleet.status, fleet.listen, fleet.keys))
+        stack.enter_context(managing(fleet.status))
         yield stack
 
 
 @pytest.fixture
 def serve_fleet(serve_site, fleet, manager):  # noqa: ARG001  # it answers
     """Starts pages of the fleet: a client of each of them."""
-    return lambda **options: serve_site(Wall(Address(fleet=fleet.address, keys=fleet.keys_of_client)), **options)
+    return lambda **options: serve_site(Wall(Address(fleet=fleet.name)), **options)
 
 
 @pytest.fixture

@@ -12,8 +12,6 @@ from starlette.exceptions import HTTPException
 from catstream.client.address import Address
 from catstream.web import wall
 from catstream.web.wall import Wall
-from catstream.wire.endpoint import Endpoint
-from catstream.wire.keys import clients, create, public_key, synchronise
 
 TOKEN = "correct-horse-battery"
 PATHS = ["/", "/status", "/metrics", "/streams/cam-7/", "/streams/cam-7/events"]
@@ -30,17 +28,6 @@ def source(page):
             if line.startswith("data: "):
                 return json.loads(line.removeprefix("data: ")).get("status", {}).get("source")
     raise AssertionError("the stream ended")
-
-
-@pytest.fixture
-def keyed(fleet, keys, folder, tcp):
-    """Gives the fleet keys and a port, a client, and a stream with keys of its own, of which this is the folder."""
-    stream = folder / "stream"
-    create(stream)
-    synchronise(stream, clients(keys))
-    fleet.listen, fleet.address = tcp, tcp.removeprefix("tcp://")
-    fleet.keys, fleet.keys_of_client = str(keys), str(folder / "anna")
-    return stream
 
 
 def test_without_the_token_nothing_of_the_fleet_is_shown(fleet, serve_fleet, until):
@@ -76,26 +63,6 @@ def test_the_newest_picture_of_a_stream_is_received_only_while_somebody_asks(fle
     assert page.get("/streams/cam-8/picture.jpg").status_code == 404
 
 
-def test_the_page_of_a_stream_follows_it_to_another_node(fleet, serve_fleet, camera_at, folder, until, monkeypatch):
-    monkeypatch.setattr("catstream.web.feed.SILENCE_SECONDS", 1.0)
-    fleet.stream("cam-7")
-    page = serve_fleet()
-    for node in ("north", "south"):
-        (folder / node).mkdir()
-        fleet.stream("cam-7", node=node, endpoint=str(folder / node))
-        turn = camera_at(Endpoint.parse(str(folder / node)), source=f"walk.mp4 at {node}")
-        until(lambda node=node: source(page) == f"walk.mp4 at {node}", turn)
-
-
-def test_a_stream_with_a_key_of_its_own_is_shown_with_the_keys_of_the_client(
-    fleet, keyed, serve_fleet, camera_at, until
-):
-    endpoint = Endpoint.parse(fleet.listen, str(keyed))
-    fleet.stream("cam-7", endpoint=fleet.listen, server=public_key(keyed))
-    page, turn = serve_fleet(), camera_at(endpoint)
-    until(lambda: source(page) == "walk.mp4", turn)
-
-
 def test_a_fleet_that_does_not_answer_is_not_ready_and_has_no_metrics_of_streams(
     fleet, manager, serve_fleet, until, monkeypatch
 ):
@@ -125,7 +92,7 @@ def test_the_page_shows_neither_the_address_nor_the_key_of_a_pipeline(fleet, ser
 
 
 def test_a_fleet_that_starts_later_is_waited_for(fleet, serve_site, managing, until):
-    page = serve_site(Wall(Address(fleet=fleet.address)))
+    page = serve_site(Wall(Address(fleet=fleet.name)))
     told = status_of(page)
     assert (told["age"], told["streams"]) == (None, [])
     assert "no fleet" in told["problem"]
@@ -140,7 +107,7 @@ def test_pages_of_streams_are_closed_when_nobody_looks_at_them(fleet, monkeypatc
         fleet.stream(f"cam-{number}")
 
     async def use():
-        pages = Wall(Address(fleet=fleet.address))
+        pages = Wall(Address(fleet=fleet.name))
         pages._status = fleet.status()
         first = pages.site("cam-1")
         with first.feed.viewed():

@@ -9,7 +9,7 @@ import zmq
 
 from catstream.base.box import Box
 from catstream.client.control import Control
-from catstream.errors import BoxError, CommandRejectedError, ServiceError
+from catstream.errors import BoxError, ServiceError
 from catstream.wire import commands
 from catstream.wire.channels import CHANNELS, CONTROL
 from catstream.wire.codec import decode, encode
@@ -161,18 +161,6 @@ def test_of_a_flood_of_commands_64_wait_others_are_rejected_and_stop_passes(endp
     assert [command.id for command in heard] == [*map(str, range(64)), "stop", "99"]
     reason = "64 commands wait for the next frame: try again later"
     assert {(answer.done, answer.reason) for answer in answers[:36]} == {(False, reason)}
-
-
-def test_a_rejected_command_raises_an_error_with_the_reason(endpoint, answering):
-    def refuse(command):
-        return Answer(command.id, False, "it is no time for that")
-
-    with (
-        answering(refuse),
-        Control(endpoint, timeout=20) as control,
-        pytest.raises(CommandRejectedError, match=r"^pause: it is no time for that$"),
-    ):
-        control.pause()
 
 
 @pytest.mark.parametrize(
