@@ -25,7 +25,6 @@ from catstream.coreset.forest import Forest
 from catstream.detection.objects import Detectors
 from catstream.errors import BoxError, CatstreamError, FrameError, ObjectError
 from catstream.features.pyramid import Pyramid
-from catstream.training import motion_em
 from catstream.training.trainer import Trainer
 from catstream.video.frames import as_bgr
 from catstream.wire.messages import Features, Track, Tracks
@@ -58,7 +57,6 @@ class MultiTracker:
 
     def __init__(self, settings: Settings | Mapping[str, object] | None = None) -> None:
         self.settings = Settings().replace(settings)
-        motion_em.prepare()  # before the first frame: a later one would wait for it
         self._tracks: dict[str, Track] | None = None
         self._is_busy = False
 

@@ -18,7 +18,7 @@ OBSERVATION_FLOOR = 1e-2  #: smallest variance of a measured centre, pixels squa
 
 
 def prepare() -> None:
-    """Import filterpy: most of a second, with scipy.stats. Otherwise the first estimate does."""
+    """Import filterpy: most of a second, with scipy.stats. Without it, the first estimate imports filterpy."""
     import filterpy.kalman  # noqa: F401
 
 
