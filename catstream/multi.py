@@ -145,9 +145,9 @@ class MultiTracker:
         FrameError
             For an array that is not a frame, a frame of another size than the first one, or a time that is not finite.
         ObjectError
-            For a name as in `init`, or one that has both a box and a saved model.
+            For a name as in `init`, or a name with both a box and a saved model.
         SettingsError
-            If the settings differ from those of a saved model.
+            If the settings differ from the settings of a saved model.
         ServiceError, ProtocolError
             If the file of a saved model cannot be read, or is not one.
         """

@@ -17,7 +17,7 @@ from msgspec import Meta
 
 from catstream.errors import BoxError
 
-#: Numbers of a rectangle in a message; one that is made here is not checked.
+#: Numbers of a rectangle in a message; a rectangle that is made here is not checked.
 _Coordinate = Annotated[float, Meta(ge=-sys.float_info.max, le=sys.float_info.max)]
 _Side = Annotated[float, Meta(gt=0, le=sys.float_info.max)]
 

@@ -1,6 +1,6 @@
 """The motion of a centre: a Kalman filter with a constant-velocity model.
 
-The state is (x, y, vx, vy), in pixels and pixels a frame; x and y are measured. The results are those of filterpy, bit
+The state is (x, y, vx, vy), in pixels and pixels a frame; x and y are measured. The results equal filterpy's, bit
 for bit, without its second of imports; the trainer smooths with filterpy.
 """
 

@@ -19,7 +19,7 @@ def prepare() -> None:
 def discriminant(background: np.ndarray, difference: np.ndarray, penalty: float) -> np.ndarray:
     """The regularised linear discriminant of two classes: w = (S + penalty I)^-1 difference, float32 (d,).
 
-    S is the covariance of the background, float32 (r, d); `difference` is the mean of the object minus that of the
+    S is the covariance of the background, float32 (r, d); `difference` is the mean of the object minus the mean of the
     background.
     """
     centred = background - background.mean(axis=0)

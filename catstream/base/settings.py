@@ -171,7 +171,7 @@ class ExtentSettings(_Group, frozen=True, kw_only=True):
 
     size_count  Number of sizes that a search may try. Raise it for an object that changes its size quickly; 1 keeps the
                 size.
-    learned     Learn the size and the aspect ratio from windows of wrong ones, and prefer those of the initial box.
+    learned     Learn size and aspect ratio from windows of wrong sizes and shapes; prefer those of the initial box.
                 Turn it off for more speed if the object keeps its shape.
     """
 
@@ -308,7 +308,7 @@ class Settings:
         return self.replace({"coreset.size": max(2, round(self.coreset.share * frames)), "coreset.share": 0.0})
 
     def replace(self, others: Settings | Mapping[str, object] | None) -> Settings:
-        """Return a copy with other values, given as in `from_values`; with none, or with those of other settings.
+        """Return a copy with other values, given as in `from_values`; with no value, or with values of other settings.
 
         Examples
         --------
@@ -387,7 +387,7 @@ class Setting:
         return " ".join([" | ".join(map(str, get_args(kind))) or kind.__name__, ", ".join(limits)]).strip()
 
     def check(self, value: object) -> Value:
-        """Return a value, or that of a text, in the type of the setting; SettingsError if it is not valid."""
+        """Convert a value or a text to the type of the setting; SettingsError if it is not valid."""
         given = value
         if getattr(value, "ndim", None) == 0:  # a number of numpy
             value = value.item()  # type: ignore[attr-defined]

@@ -15,7 +15,7 @@ def listed(names: Iterable[str]) -> str:
 
 
 def counted(number: float, noun: str) -> str:
-    """A number and what is counted, in the singular or the plural.
+    """A number and a noun, in the singular or the plural.
 
     >>> counted(1, "frame"), counted(0, "frame")
     ('1 frame', '0 frames')

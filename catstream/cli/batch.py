@@ -44,7 +44,7 @@ def batch(
     BOXES is a CSV file with the columns file, object, x, y, w, h, and optionally
     frame, which counts from 0. Paths are relative to its folder. Each object is
     tracked from its box to the end of the video. If it has boxes in several
-    frames, it is tracked between them and checked, as by catstream annotate.
+    frames, it is tracked between them and checked, as catstream annotate does.
 
     A video that fails does not stop the others; the exit status is then 1. The
     same command continues after Ctrl-C, and tracks only videos that failed, are

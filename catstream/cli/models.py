@@ -133,7 +133,7 @@ def merge(files: tuple[Path, ...], output: Path, overwrite: bool, force: bool) -
     """Merge saved models of one object, for example from two cameras.
 
     The coreset trees are merged, and a model is trained from them. Its scores are
-    those of one tree of all the videos, within the error bound of the coreset.
+    within the error bound of the coreset as if one tree had seen all videos.
     The files must have the same object and settings, and no frames in common.
     Models of dissimilar objects are rejected, or merged with a warning.
 

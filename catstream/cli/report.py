@@ -20,7 +20,7 @@ from catstream.errors import VideoError
 def report(files: tuple[Path, ...], skip_damaged: bool, scale: str, overwrite: bool) -> None:
     """Write an HTML page about the tracks of a run.
 
-    LOG is an .ndjson, .sqlite or .csv file, or a folder, for example that of
+    LOG is an .ndjson, .sqlite or .csv file, or a folder, for example from
     catstream batch, whose .ndjson files are reported together. Rotated files of
     a run are joined. PAGE is by default LOG with the extension .html, or
     report.html in the folder.

@@ -142,7 +142,7 @@ def fleet_view(address: Address, listen: HostPort) -> None:
     """Watch all streams of a fleet in a browser.
 
     The page is a wall of pictures, those in trouble first, and a table of the
-    nodes. Each stream links to its own page, as of catstream view.
+    nodes. Each stream links to the page of its own run.
     If the fleet does not answer, the page keeps its last state and waits.
     Ctrl-C ends the server; the fleet continues. Token and encryption are as
     for catstream view.

@@ -24,7 +24,7 @@ _SCHEME = "fleet://"
 class Address:
     """A running pipeline, or a stream of a fleet, wherever it runs; and the keys to connect with.
 
-    endpoint  of the pipeline; empty for the only one that runs
+    endpoint  of the pipeline; empty for the only running pipeline
     stream    name of the stream; empty for a pipeline
     fleet     of the stream: HOST:PORT of its registry, or its name; empty for the only one of this user
     keys      folder of the keys of this client; empty if there are none
@@ -67,14 +67,14 @@ class Address:
         return Registry(self.fleet, self.keys)
 
     def with_endpoint(self) -> Address:
-        """The same address; if it names no pipeline, the endpoint of the one that runs, also when others start."""
+        """The same address; if it names no pipeline, the endpoint of the running one, kept when others start."""
         if self.stream or self.endpoint:
             return self
         endpoint = self.resolve()
         return Address(str(endpoint), keys=str(endpoint.keys.folder) if endpoint.keys is not None else "")
 
     def resolve(self) -> Endpoint:
-        """The endpoint of the pipeline, or of the one that the stream has now.
+        """The endpoint of the pipeline, or of the current pipeline of the stream.
 
         ServiceError if there is no such pipeline or stream, or the stream does not run; SilenceError if the registry
         does not answer. A pipeline at an endpoint that is named may start later.

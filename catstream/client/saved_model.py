@@ -1,4 +1,4 @@
-"""A saved model: everything that was learned of one object, as one file.
+"""A saved model: everything learned about one object, in one file.
 
 The file contains the coreset trees whole, with the energy that they have lost, and the model that was trained from
 them. A run in another video continues from it, as if the frames of both had come from one stream.
@@ -149,7 +149,7 @@ class SavedModel:
 
     @classmethod
     def from_bytes(cls, data: bytes, name: str) -> Self:
-        """The reverse of `to_bytes`; `name` of the file is for the errors, which are those of `load`."""
+        """The reverse of `to_bytes`; `name` of the file is for errors, the same as in `load`."""
         arrays, metadata = storage.decode(data, name)
         try:
             if metadata.get("kind") != _KIND:
@@ -229,7 +229,7 @@ def continued(features: Features, settings: Settings) -> dict[str, Compressor]:
     }
 
 
-@one_thread()  # of the trees, too: more threads add in another order, which changes the bits
+@one_thread()  # also of the trees: more threads add in another order, which changes the bits
 def merge(parts: Iterable[SavedModel], *, force: bool = False) -> SavedModel:
     """One saved model from several of the same object, as if one stream had contained all their frames.
 
@@ -290,7 +290,7 @@ def merge(parts: Iterable[SavedModel], *, force: bool = False) -> SavedModel:
 
 
 def _check_alike(parts: Sequence[SavedModel]) -> None:
-    """Raise SettingsError, or warn, if the models do not look like those of one object.
+    """Raise SettingsError, or warn, if the models do not look like models of one object.
 
     The models are connected by their highest similarities, as in a maximum spanning tree; the lowest of these decides.
     """

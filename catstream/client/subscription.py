@@ -136,7 +136,7 @@ class Subscription(Generic[Message]):
     def missed(self) -> int:
         """Number of frames whose tracks or features were not received, or were passed over.
 
-        Those of one object count between its first and its last frame.
+        Frames of one object count between its first and its last frame.
         """
         return self._gaps.missed + self._gaps.before
 
@@ -277,7 +277,7 @@ class Subscription(Generic[Message]):
         self.end, self._close_time = end, monotonic() + seconds
 
     def _look_for_pipeline(self) -> None:
-        """End if the pipeline has removed its sockets from its folder, as it does at last.
+        """End if the pipeline has removed its sockets from its folder, its last step.
 
         A subscriber that did not read since a restart has no subscription there, and misses the end.
         """

@@ -161,7 +161,7 @@ class Compressor:
             "origin": self._origin,
             "earlier": list(self._earlier),
         }
-        # The trees have grown since the last sample. It is stored, too, so that a restarted trainer trains the model
+        # The trees have grown since the last sample. It is stored as well, so that a restarted trainer trains the model
         # that the detector uses.
         for name, message in (("sample", self.last_sample), ("detector", self.detector)):
             if message is not None:
@@ -200,7 +200,7 @@ def sample_of(
 
 
 def _rows_of(tree: Tree, training: TrainingRows) -> Float32:
-    """The rows of a tree: those of its label, or all of them with their labels, times the roots of their weights."""
+    """The rows of a tree, times the roots of their weights: rows with its label, or all rows with their labels."""
     rows: Float32 = training.rows
     if tree.label is not None:
         has_label: Bool = training.labels == tree.label

@@ -25,7 +25,7 @@ _MAX_STATES = 256  # messages whose detector states are stored: a restarted dete
 class Forest:
     """Inserts the features of every frame, and returns the samples of the objects whose trees have grown enough.
 
-    An object begins with its first features, with new trees or with those of an earlier stream. If a message lacks an
+    An object begins with its first features, with new trees or the trees of an earlier stream. If a message lacks an
     object, its trees are dropped. The same messages make the same samples, bit for bit, also across `save` and `load`.
 
     seq          number of the newest message
@@ -106,7 +106,7 @@ class Forest:
         return earlier[-1] if earlier else self._states[0][1]
 
     def _add(self, sample: Sample | None, samples: list[Sample]) -> None:
-        """Add a sample, if there is one, to those of a frame."""
+        """Add a sample, if there is one, to the samples of a frame."""
         if sample is not None:
             self.version = sample.version
             samples.append(sample)

@@ -104,12 +104,12 @@ class CoresetTree:
     def insert(self, rows: np.ndarray) -> None:
         """Add rows, float32 (k, d), in the order of the stream.
 
-        ProtocolError, a ValueError, if their length differs from that of earlier rows, or if a number is not finite.
+        ProtocolError, a ValueError, if their length differs from earlier rows, or if a number is not finite.
         """
         self.extend(self._checked(rows))
 
     def extend(self, rows: np.ndarray) -> None:
-        """Add rows as `insert` does, without its checks: those of a message were checked when it was received."""
+        """Add rows as `insert` does, without its checks: the rows of a message were checked at reception."""
         # Once for all leaves, and not for rows that complete none: the limit costs as much as inserting some rows.
         with one_thread() if self._filled + len(rows) >= self.size else nullcontext():
             while len(rows):
@@ -229,7 +229,7 @@ class CoresetTree:
         return rows
 
     def _check(self, pending: np.ndarray) -> None:
-        """Raise ValueError unless the nodes, and the pending rows that follow them, are those of a tree."""
+        """Raise ValueError unless the nodes, and the pending rows that follow them, can be a tree."""
         levels = [node.level for node in self.nodes]
         if levels != sorted(set(levels), reverse=True):
             raise ValueError(f"levels {levels} are not strictly decreasing")
@@ -251,7 +251,7 @@ class FrequentDirections(CoresetTree):
     It stores one node of n rows and fewer than n pending rows: a new leaf is stacked below the node, and the 2n rows
     are shrunk to n, see `catstream.coreset.reduce.shrink`. In addition to the bound of a tree, for every unit
     vector y, `0 <= ||A y||^2 - ||C y||^2 <= c / (n + 1) <= ||A||^2 / (n + 1)`, up to rounding, for one stream and for
-    merged ones. Here c is `dropped_energy`, which is larger than that of a tree because all directions are shrunk.
+    merged ones. Here c is `dropped_energy`, larger than in a coreset tree because all directions are shrunk.
 
     >>> sketch = FrequentDirections(size=4)
     >>> sketch.insert(np.eye(13, 5, dtype=np.float32))

@@ -69,7 +69,7 @@ class Detector:
     ) -> Result:
         """Start with the box of an object in pixels of the frame; a previous object is forgotten.
 
-        `together` is that of the state: the objects whose boxes overlap this one.
+        `together`, as in the state: the objects whose boxes overlap this one.
 
         BoxError if tracking cannot start with the box in this frame (see `Box.validated`), or if the object is
         indistinguishable from its background. The detector is then unchanged.
@@ -119,7 +119,7 @@ class Detector:
         """Update the state by the detection of `search`, or another one in the same frame, and cut training rows."""
         state = self._current_state()
         # Step 1: update the belief, and move the window as it allows.
-        if self._scm is not None:  # never absent: the first leaf is of the first n frames, whatever its score is
+        if self._scm is not None:  # never absent: the first leaf consists of the first n frames at any score
             state = replace(state, level="confident", window=detection.window)
         else:
             state = belief.update_level(state, detection.score, detection.redetected, self.settings.belief)

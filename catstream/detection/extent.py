@@ -55,7 +55,7 @@ def smooth(before: Window, window: Window, *, resize: bool) -> Window:
 
 
 def trials(window: Window, settings: ExtentSettings) -> list[list[Trial]]:
-    """Windows of wrong sizes, then of wrong aspect ratios; only of what is searched, none unless they are learned."""
+    """Windows of wrong sizes, then of wrong aspect ratios, as far as each is searched; none unless they are learned."""
     if not settings.learned:
         return []
     sizes = [Trial(window.scaled(size(k)), larger=k) for k in _steps(settings.size_count // 2)]
@@ -83,7 +83,7 @@ def offset_cost(row: np.ndarray, head: np.ndarray, bias: float) -> float:
 
 
 def cost(change: float, deviation: float = 0.0, prior: float = 0.0) -> float:
-    """Cost of a change of log f, which already deviates from that of the first window by `deviation`."""
+    """Cost of a change of log f, which already deviates by `deviation` from the first window."""
     return _PENALTY * abs(change) + prior * (change + deviation) ** 2
 
 

@@ -64,7 +64,7 @@ class SparseCollaborativeModel:
 
         Returns
         -------
-        score, 0 to 1, above 0.5 if the templates of the object reconstruct the box better than those of the background;
+        score, 0 to 1, above 0.5 if templates of the object reconstruct the box better than templates of the background;
         and the box, without its rotation
         """
         grey = _grey(image)

@@ -22,7 +22,7 @@ class Similarity:
     """The subspace of an object, and the share of the energy of its own rows that lies in it.
 
     With the mean b of the background, the share of a row x is ||V (x - b)||^2 / ||x - b||^2. Its similarity is this
-    share divided by that of the object's own rows, so that one threshold holds for all objects.
+    share divided by the share of the object's own rows, so that one threshold holds for all objects.
 
     basis       V, float32 (k, d), orthonormal rows
     background  b, float32 (d,)

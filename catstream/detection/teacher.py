@@ -102,7 +102,7 @@ def training_of(context: FrameContext, window: Window, around: ScoreMap | None) 
 def training_at(
     context: FrameContext, window: Window, around: ScoreMap | None = None, *, extents: bool = True
 ) -> Training:
-    """The rows of an object at a window, and those of group "extent" if `extents`.
+    """The rows of an object at a window, with rows of group "extent" if `extents`.
 
     Near misses and background are cut from the windows `around` it, if a search scored enough of them.
     """
@@ -177,7 +177,7 @@ def affine_copies(
     All copies of a frame have the same background in the corners of the window, which is not the object: the share
     `moved` of the copies is put on another background of the frame. An object that turns shows another side, which is
     often the mirror image: the last `mirrored` copies are flipped left to right. Returns float32 (count, d); the first
-    row is that of the window itself.
+    row is the window itself.
     """
     changes = rng.normal(size=(count, 4))
     if count:

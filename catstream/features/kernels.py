@@ -487,7 +487,7 @@ def _taps(scale: float, size: int, pixels: UInt32, shares: Float32) -> None:
 def average(image: UInt8, across: float, down: float, output: UInt8) -> None:
     """Reduce an image of three channels: the mean of the `across` x `down` pixels that an output pixel covers.
 
-    The pixels are those of `cv2.INTER_AREA`, which takes twice as long.
+    The pixels equal `cv2.INTER_AREA`, which takes twice as long.
     """
     rows, columns = output.shape[:2]
     below, right = max(3, int(np.ceil(down)) + 1), max(3, int(np.ceil(across)) + 1)

@@ -4,7 +4,7 @@ The desired streams are in the store, and actors have names, so a controller tha
 touches no stream that runs. Ray places a stream, and starts it again elsewhere if its process or its node
 dies. One thread looks at the actors twice a second, and answers the registry in between; calls from
 `catstream.fleet.fleet` come in threads of Ray. Only these use the store, so a store that hangs delays nothing but the
-change that waits for it. What is answered as done is stored.
+change that waits for it. A change is stored before it is answered.
 """
 
 from __future__ import annotations

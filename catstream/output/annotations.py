@@ -60,7 +60,7 @@ class About:
     label    class of all objects; empty if the name of each is its class
     classes  names of the classes in the order of their numbers; empty for the order of the log
     images   files of the images of the source; empty if it is a video
-    prefix   of the names of these images: those of several logs may be the same
+    prefix   of the names of these images, since several logs may use the same names
     source   path of the source whose images are written; empty to write none
     is_first whether this is the first log of a data set: the labels of an earlier one are removed
     """

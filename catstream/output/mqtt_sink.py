@@ -8,7 +8,7 @@
                            ends. While the source is lost, `present` is null. NAME is "-" for the object without a name
     homeassistant/binary_sensor/catstream/ID/config     a sensor for each object, and for each object in each zone
 
-All have QoS 1. While the broker is away, events wait for it, and states are dropped, as the next one replaces them.
+All have QoS 1. While the broker is away, events wait for it, and states are dropped, since the next one replaces them.
 """
 
 from __future__ import annotations

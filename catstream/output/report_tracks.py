@@ -97,7 +97,7 @@ class _Object:
     def row(self) -> list[float]:
         """The values of `_COLUMNS`: shares from 0 to 1, NaN if unknown. Seconds are those in which it is present.
 
-        The maximum speed is that of the fastest quarter of a second, because boxes jitter from frame to frame.
+        The maximum speed is a mean over a quarter of a second, because boxes jitter from frame to frame.
         """
         distance, tracked = np.nansum(self.steps), np.diff(self.times)[~np.isnan(self.steps)].sum()
         shares = [float(np.mean(self.states == state)) for state in ("present", "doubtful", "absent")]
@@ -177,7 +177,7 @@ class Section:
                 self.problem = str(error)
 
     def _frames_to_look_at(self) -> dict[int, str]:
-        """The middle of each of the longest doubtful stretches, and what is doubtful there."""
+        """The middle of each of the longest doubtful stretches, and the reason."""
         runs = [
             (frames.stop - frames.start, int(item.frames[(frames.start + frames.stop) // 2]), name)
             for name, item in self._objects.items()

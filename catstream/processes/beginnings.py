@@ -121,7 +121,7 @@ class Beginnings:
             frames = [*since, frame]
             place = f"at {box} in the picture {frame.time - command.time:.1f} s before frame {detectors.seq}"
         elif command.time is not None:
-            place += ", as the picture in which it was drawn is not stored any more"
+            place += ", since the picture in which it was drawn is not stored any more"
         pyramids = (Pyramid(one.image) for one in frames)
         first = next(pyramids)
         check_room(name, commands.desired, self._process.settings.run.max_objects)

@@ -93,7 +93,7 @@ def files(folder: Path) -> dict[str, bytes]:
 def restore(folder: Path, content: Mapping[str, bytes]) -> None:
     """Write what `files` returned to a new folder, from which a pipeline can be resumed.
 
-    ServiceError if a name is not one that `files` returns, or a file cannot be written.
+    ServiceError if `files` does not return a name, or a file cannot be written.
     """
     for name, data in content.items():
         if name not in _SMALL and not _LARGE.fullmatch(name):

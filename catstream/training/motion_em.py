@@ -59,8 +59,8 @@ def learn_motion(centres: np.ndarray, iterations: int = 5) -> Motion | None:
 def _start(centres: np.ndarray) -> tuple[np.ndarray, np.ndarray, Motion]:
     """Initial state, its covariance, and initial parameters, in proportion to the speed of the centres."""
     speed = np.mean(np.diff(centres, axis=0) ** 2)
-    # The variance of a second difference is 6 times that of the observation noise, plus 2 times that of the process
-    # noise of the position, plus that of the velocity.
+    # Variances: a second difference = 6 x observation noise + 2 x process noise of the position + process noise of
+    # the velocity.
     share = np.mean(np.diff(centres, n=2, axis=0) ** 2) / 9 + OBSERVATION_FLOOR
     mean = np.concatenate([centres[0], [0, 0]])
     return mean, np.diag([share, share, share + speed, share + speed]), Motion(share * np.eye(4), share * np.eye(2))

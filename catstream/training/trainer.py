@@ -37,7 +37,7 @@ class Trainer:
         all models are comparable. ProtocolError if object and background have the same mean in the sample.
         """
         self._regressions[sample.object] = self._regressions.pop(sample.object, {})
-        if len(self._regressions) > self.settings.run.max_objects:  # the oldest is that of a forgotten object
+        if len(self._regressions) > self.settings.run.max_objects:  # the oldest object was forgotten
             del self._regressions[next(iter(self._regressions))]
         background_mean = sample.trees["background"].mean
         difference = sample.trees["object"].mean - background_mean

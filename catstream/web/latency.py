@@ -12,7 +12,7 @@ _LATENCIES = (0.01, 0.02, 0.03, 0.05, 0.07, 0.1, 0.15, 0.2, 0.3, 0.5, 1.0, 2.0, 
 
 
 class Latency:
-    """Measures the seconds from the arrival of a frame of a live source to that of its track at this process."""
+    """Measures the seconds between the arrival of a live frame and the arrival of its track at this process."""
 
     def __init__(self) -> None:
         self._zero: tuple[str, float] | None = None  # of a run, Unix time at which the time of its source is 0

@@ -85,7 +85,7 @@ class Sender(ChannelSocket[Message]):
         self._transmit()
 
     def poll(self, seconds: float) -> None:
-        """Process acknowledgements, waiting at most this long for the first; retransmit what is missing.
+        """Process acknowledgements, waiting at most this long for the first; retransmit missing messages.
 
         Raises the errors of `SendWindow.receive`.
         """

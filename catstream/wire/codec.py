@@ -15,7 +15,7 @@ Version, kind and object are the first bytes of a message, and thus its topic: a
 message, and one object.
 
 msgpack packs and unpacks the bytes, within limits on the length of every text, list and map and on the number of all
-entries; msgspec converts the values to the fields of their kind, and skips what is not one of them. A sender checks
+entries; msgspec converts the values to the fields of their kind, and skips all others. A sender checks
 what it sends in the same way, so that nothing leaves it that would be rejected on arrival.
 """
 

@@ -107,7 +107,7 @@ class Responder(ChannelSocket[Question | Answer], Generic[Question, Answer]):
         self._bind()
 
     def receive_all(self, seconds: float = 0.0) -> list[Question]:
-        """The new questions, oldest first; each has to be answered. One that was repeated is not among them.
+        """The new questions, oldest first; each has to be answered. Repeated questions are left out.
 
         It waits so many seconds for the first one. A flood does not stop the process: the rest waits for the next call.
         """

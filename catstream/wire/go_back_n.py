@@ -90,7 +90,7 @@ class SendWindow:
         self._last_reply = now
 
     def receive(self, position: Position, now: float) -> bool:
-        """Process a reply; returns False for one that is older than the last one, which changes nothing.
+        """Process a reply; returns False, and changes nothing, if it is older than the last one.
 
         ProtocolError if the receiver has stored messages that were never sent, StreamRewoundError if it needs messages
         that it had acknowledged before, and that were dropped here.

@@ -56,7 +56,7 @@ class Tree:
 
     @property
     def more_columns(self) -> int:
-        """Number of its columns in addition to those of a feature row."""
+        """Number of its columns in addition to a feature row."""
         return 1 + len(self.heads) if self.label is None else 0
 
 
@@ -69,7 +69,7 @@ TREES = {
     tree.name: tree
     for tree in (
         Tree("object", APPEARANCE, 1.0, (), True, "Object", "what the object has looked like"),
-        Tree("background", APPEARANCE, 0.0, (), True, "Background", "what is around it"),
+        Tree("background", APPEARANCE, 0.0, (), True, "Background", "the background around the object"),
         Tree(
             "loss", APPEARANCE, None, (Head("loss", 0.1, adds_to_score=True),), True, "Object or background",
             "both, with the score that each should get: the score is learned from these",

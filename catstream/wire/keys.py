@@ -167,13 +167,13 @@ def _read(path: Path) -> dict[str, Any]:
             facts = os.fstat(file.fileno())
             if facts.st_uid not in (os.geteuid(), 0) or facts.st_mode & (0o077 if path.suffix == ".key" else 0o022):
                 raise ServiceError(
-                    f"other users can access {path}: chmod 600, and make new keys if somebody may have read it"
+                    f"other users can access {path}: chmod 600, and make new keys if others may have read it"
                 )
             return tomllib.loads(file.read(_MAX_BYTES).decode())
     except OSError as error:
         raise ServiceError(
             f"cannot read {path} ({error.strerror}): a pipeline needs the folder that `catstream keys new` made, and a "
-            "client one that `catstream keys allow` made"
+            "client file that `catstream keys allow` made"
         ) from None
     except (ValueError, RecursionError) as error:
         raise ServiceError(f"{path} is damaged ({error}): make new keys") from None

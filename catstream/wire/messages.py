@@ -47,7 +47,7 @@ Verb = Literal["set-box", "search", "forget", "pause", "resume", "save", "stop"]
 #: Bytes of a saved model at most.
 LARGEST_MODEL = 511 << 20
 
-#: The same for one that an object begins with.
+#: The same for a saved model that an object begins with.
 LARGEST_GIVEN_MODEL = 63 << 20
 
 #: Bytes at most of all saved models that objects begin with in one frame: one message contains them.
@@ -56,7 +56,7 @@ LARGEST_GIVEN_MODELS = 200 << 20
 #: The state of a run, see `run_state`: "lost" is its source, "waiting" is for a box.
 RunState = Literal["running", "lost", "waiting", "paused", "ended"]
 
-#: The state of a stream of a fleet: that of its run, or why it has none.
+#: The state of a stream of a fleet: the state of its run, or why it has none.
 StreamState = Literal["starting", "running", "lost", "waiting", "paused", "moving", "stopping", "failed", "ended"]
 
 NodeState = Literal["alive", "dead"]
@@ -419,7 +419,7 @@ class Health:
 def run_state(counters: Mapping[str, float]) -> tuple[RunState, str]:
     """The state of a run by the counters of its detector: the name of the first that holds, and all in words.
 
-    Whatever shows whether a run tracks, and if not, why, takes it from here.
+    The single source of the state that commands, the page and /readyz show.
 
     >>> run_state({"lost_seconds": 12.3, "paused": 1.0})
     ('lost', 'source lost for 12 s, paused')

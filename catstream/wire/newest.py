@@ -115,7 +115,7 @@ class Subscriber(ChannelSocket[Message]):
 
     If the channel keeps the newest message, older ones of the same object are passed over. The objects take turns: the
     message of the object that has waited longest is received first. `only` limits it to one kind of message, and
-    `about` to those of this kind about one object. With `newest`, this holds for any channel.
+    `about` to this kind of messages about one object. With `newest`, this holds for any channel.
     """
 
     def __init__(
@@ -169,7 +169,7 @@ class Subscriber(ChannelSocket[Message]):
     def _is_repeat(self, message: Message, data: bytes) -> bool:
         """Return True if a message is the last one of its object or process, which is sent again now and then.
 
-        It is identified by its version. One that has none is small, and identified by all of its bytes.
+        It is identified by its version. A message without a version is small, and identified by all of its bytes.
         """
         if not self._newest:
             return False
@@ -189,7 +189,7 @@ class GapCounter:
 
     The tracks of all objects in a frame have the same number. A restarted sender may repeat numbers.
 
-    missed  frames without a message between the first and the last one that was received
+    missed  frames without a message, between the first and the last received frame
     before  frames before the first message that was received
     """
 

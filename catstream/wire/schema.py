@@ -33,10 +33,10 @@ Limit = TypeVar("Limit")
 
 LARGEST_INTEGER = 2**53  # so that a reader in any language holds it exactly
 LONGEST_LIST = 256  # entries of a list or map: levels of a tree, counters
-LONGEST_TEXT = 16384  # characters: the names of 64 objects, and what is to be said about them
+LONGEST_TEXT = 16384  # characters: 64 names of objects in a sentence
 
 Integer = Annotated[int, Meta(ge=0, le=LARGEST_INTEGER)]
-Number = Annotated[float, Meta(ge=-sys.float_info.max, le=sys.float_info.max)]  # NaN is outside, too
+Number = Annotated[float, Meta(ge=-sys.float_info.max, le=sys.float_info.max)]  # also excludes NaN
 Text = Annotated[str, Meta(max_length=LONGEST_TEXT)]
 ObjectName = Annotated[str, Meta(pattern=rf"\A{PATTERN}\Z")]
 #: A map of something by the name of an object, and by any text.
@@ -175,7 +175,7 @@ def _check(field: Field, value: Any, lengths: _Lengths, where: str) -> _Lengths 
 def _check_names(lengths_of: dict[str, _Lengths | None], named: Named, where: str) -> None:
     """Check the names of a map, and that its messages have rows of d columns, each with those that its name adds.
 
-    The lengths of an array are None: it shares those of the message around it.
+    The lengths of an array are None: it shares the lengths of the enclosing message.
     """
     if not named.required <= lengths_of.keys() <= named.columns.keys():
         expected = ", ".join(f"{name} (always)" if name in named.required else name for name in named.columns)

@@ -1,6 +1,6 @@
 """Files of arrays and metadata in the safetensors format, with a checksum.
 
-A message is kept as arrays and metadata, too: `pack` and `unpack`.
+`pack` and `unpack` convert a message to arrays and metadata, and back.
 """
 
 from __future__ import annotations
@@ -138,7 +138,7 @@ def pack(message: object, name: str) -> tuple[Arrays, Metadata]:
 
 
 def unpack(kind: type[Message], arrays: Arrays, metadata: Metadata, name: str) -> Message:
-    """The message that `pack` took, bit for bit; TypeError or ValueError if it is none of this kind.
+    """The message that `pack` took, bit for bit; TypeError or ValueError if it is of another kind.
 
     The limits of its arrays are not checked: `catstream.wire.schema` does that.
     """
