@@ -26,7 +26,7 @@ from catstream.multi import MultiTracker
 from catstream.offline.annotation import Annotation
 from catstream.offline.keyframes import Keyframe, KeyframeBox, by_object, format_keyframe, parse_row
 from catstream.output.destinations import Header, Origin, TrackedFrame
-from catstream.output.track_log import Log, RunFiles, places_of
+from catstream.output.track_log import Log, RunFiles, destinations_of
 from catstream.processes.job import Results
 from catstream.video.source import open_source
 from catstream.wire.messages import Track
@@ -152,7 +152,7 @@ class Batch:
         self.rows = {row.video: row for row in read_summaries(self._table) if not row.error}
         for video in videos:
             files, row = _files(video, output, overwrite=True), self.rows.get(video.file)
-            is_missing = any(not Path(place).exists() or not Path(place).stat().st_size for place in files.places)
+            is_missing = any(not Path(dest).exists() or not Path(dest).stat().st_size for dest in files.destinations)
             if row is not None and (overwrite or is_missing or row.boxes != video.boxes):
                 del self.rows[video.file]
         self._write()
@@ -222,7 +222,7 @@ def read_summaries(path: Path) -> list[Summary]:
 def _files(video: Video, output: Path, header: Header | None = None, *, overwrite: bool) -> RunFiles:
     """The files of a video; VideoError if they exist, unless `overwrite`, or cannot be written."""
     origin = Origin(header or Header(source=str(video.path)))
-    files = RunFiles(origin, output, places_of(video.name, Results(output=output)))
+    files = RunFiles(origin, output, destinations_of(video.name, Results(output=output)))
     files.check(overwrite=overwrite, earlier=[])
     return files
 

@@ -20,7 +20,7 @@ from catstream.base.settings import PRESETS, describe
 from catstream.cli import COMMANDS, load_command
 from catstream.output.destinations import SINKS
 from catstream.output.exports import EXPORTS
-from catstream.output.track_log import places_of
+from catstream.output.track_log import destinations_of
 from catstream.processes.job import Results
 
 ROOT = Path(__file__).parents[1]
@@ -86,7 +86,7 @@ def test_every_command_and_option_has_help_and_is_shown():
 
 def test_every_destination_and_format_of_tracks_is_explained():
     shown = page("docs/how-to/sinks.md")
-    for name in places_of("NAME", Results(Path(), video=True)):
+    for name in destinations_of("NAME", Results(Path(), video=True)):
         assert f"`{name}`" in shown
         assert f"`{name}`" in page("docs/tutorial.md")
     names = {".": "FILE", "/": "DIR"}

@@ -287,12 +287,12 @@ class _ResultFiles:
 
     def _log(self) -> RunFiles:
         from catstream.output.destinations import Header, Origin
-        from catstream.output.track_log import RunFiles, places_of
+        from catstream.output.track_log import RunFiles, destinations_of
 
         frames = self._annotation.frames
         changed = tuple(self._annotation.settings.changed())
         header = Header(source=self._video, size=frames.size, rate=frames.rate, frames=len(frames), settings=changed)
-        return RunFiles(Origin(header), self.folder, places_of(frames.name, Results(output=self.folder)))
+        return RunFiles(Origin(header), self.folder, destinations_of(frames.name, Results(output=self.folder)))
 
 
 def _report(annotation: Annotation) -> None:

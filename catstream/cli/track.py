@@ -44,7 +44,7 @@ from catstream.output.destinations import (
     redacted,
 )
 from catstream.output.options import parse_rotation
-from catstream.output.track_log import OpenFiles, RunFiles, places_of
+from catstream.output.track_log import OpenFiles, RunFiles, destinations_of
 from catstream.pipeline import Pipeline
 from catstream.processes.job import Results
 from catstream.processes.state import contains_run, files_of_state
@@ -60,17 +60,17 @@ _COMPLETE = (
 )
 
 
-def _files_only(_: click.Context, __: click.Parameter, places: tuple[str, ...]) -> tuple[str, ...]:
+def _files_only(_: click.Context, __: click.Parameter, destinations: tuple[str, ...]) -> tuple[str, ...]:
     """Check that no destination is an address or a folder."""
-    for place in places:
-        if place != STDOUT and not is_file(place):
-            where = redacted(place)
+    for dest in destinations:
+        if dest != STDOUT and not is_file(dest):
+            where = redacted(dest)
             raise click.UsageError(f"--write takes files, not {where}: attach it to the run, catstream sink {where}")
-        if kind_of(place) not in SINKS:
+        if kind_of(dest) not in SINKS:
             raise click.UsageError(
-                f"--write {place}: expected a name that ends with .ndjson, .csv, .sqlite or .mp4, or -"
+                f"--write {dest}: expected a name that ends with .ndjson, .csv, .sqlite or .mp4, or -"
             )
-    return places
+    return destinations
 
 
 @click.command()
@@ -163,7 +163,7 @@ def track(
         results=Results(  # absolute, to resume from any folder; a resumed run keeps the files that are None
             output=output and output.absolute(),
             video=video,
-            write=tuple(Path(place).absolute() for place in write if place != STDOUT) if write else None,
+            write=tuple(Path(dest).absolute() for dest in write if dest != STDOUT) if write else None,
             models={name: file.absolute() for name, file in saved.items()},
             rotate=rotate,
             keep=keep,
@@ -203,10 +203,10 @@ class _Run:
     def files(self) -> RunFiles:
         """All files of tracks."""
         pipeline, results = self.pipeline, self.pipeline.results
-        places = [*places_of(pipeline.name, results), *([STDOUT] if self.stdout else [])]
+        destinations = [*destinations_of(pipeline.name, results), *([STDOUT] if self.stdout else [])]
         options = SinkOptions(rotate=parse_rotation(results.rotate) if results.rotate else None, keep=results.keep or 0)
         origin = Origin(pipeline.header, Address(keys=pipeline.settings.run.keys), options)
-        return RunFiles(origin, results.output, places)
+        return RunFiles(origin, results.output, destinations)
 
     def check(self) -> None:
         """Raise VideoError or UsageError if a file of the run could not be written."""
@@ -216,7 +216,7 @@ class _Run:
         others = {f"the saved model of {name or 'the object'}": file for name, file in results.models.items()}
         if self.folder is not None:
             others |= files_of_state(self.folder)
-        earlier = places_of(pipeline.name, pipeline.earlier_results)
+        earlier = destinations_of(pipeline.name, pipeline.earlier_results)
         files.check(overwrite=self.overwrite, earlier=earlier, others=others)
         for file in set(results.models.values()) - set(pipeline.earlier_results.models.values()):
             check_result(file, overwrite=self.overwrite, source=pipeline.source, made=results.output)
@@ -316,13 +316,13 @@ class _Run:
 
     def _say_what_holds(self, console: Console) -> None:
         """Say how a run goes on that is paused or has no object."""
-        place = f"--endpoint {quote(self.pipeline.endpoint)}"
+        endpoint = f"--endpoint {quote(self.pipeline.endpoint)}"
         if self.pipeline.holding == "waiting":
-            page = "the page" if self.view is not None else f"the page of catstream view {place}"
-            ways = f"draw one on {page}, or run catstream set-box [NAME=]X,Y,W,H {place}"
+            page = "the page" if self.view is not None else f"the page of catstream view {endpoint}"
+            ways = f"draw one on {page}, or run catstream set-box [NAME=]X,Y,W,H {endpoint}"
             console.print(f"waiting for a box: {ways}")
         elif self.pipeline.holding == "paused":
-            console.print(f"paused: to continue, catstream resume {place}")
+            console.print(f"paused: to continue, catstream resume {endpoint}")
 
 
 def _doubtful(boxes: Mapping[str, Box], width: int, height: int) -> list[str]:

@@ -87,12 +87,12 @@ def _header(address: Address) -> Header:
 
 
 @click.command()
-@click.argument("places", nargs=-1, required=True, metavar="DEST...")
+@click.argument("destinations", nargs=-1, required=True, metavar="DEST...")
 @_with_options
 @with_address
 @with_wait
 @with_table(SINKS)
-def sink(places: tuple[str, ...], values: dict[str, Any], address: Address, wait: float) -> None:
+def sink(destinations: tuple[str, ...], values: dict[str, Any], address: Address, wait: float) -> None:
     """Write the tracks of a running pipeline to each DEST, until it ends or Ctrl-C.
 
     Each track is written when it arrives. The pipeline does not wait; missed
@@ -114,10 +114,10 @@ def sink(places: tuple[str, ...], values: dict[str, Any], address: Address, wait
       catstream sink https://example.com/hook events/ --when lost=10,entered
     """
     try:
-        options = parse(values, places, _flag)
+        options = parse(values, destinations, _flag)
     except SettingsError as error:
         raise click.UsageError(str(error)) from None
-    files = RunFiles(Origin(options=options), None, [*dict.fromkeys(places)])
+    files = RunFiles(Origin(options=options), None, [*dict.fromkeys(destinations)])
     files.check(overwrite=True, earlier=[])
     received, not_written, reason, run = 0, 0, "", ""
     newest: dict[str, int] = {}  # frame of the last track of each object

@@ -168,7 +168,7 @@ class Stream:
             stack.callback(over.set)
             for tracks in pipeline.by_frame(_TRACKS_SECONDS):
                 self._take(pipeline, tracks, outputs)
-                if tracks and files.places:
+                if tracks and files.destinations:
                     if outputs is None:
                         outputs = files.continued(pipeline.endpoint, resume=resume)
                         closed_last.enter_context(outputs)
@@ -200,7 +200,7 @@ class Stream:
         check_zones(options.zone, pipeline.size)
         origin = Origin(pipeline.header, Address(keys=pipeline.settings.run.keys), options)
         files = RunFiles(origin, None, list(self._spec.write))
-        if resume and any(path.exists() for path in map(Path, files.places) if is_log(path)):
+        if resume and any(path.exists() for path in map(Path, files.destinations) if is_log(path)):
             pipeline.first_frame, pipeline.first_time = files.position()
         return files
 

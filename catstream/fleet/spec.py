@@ -166,9 +166,9 @@ class FleetSpec:
         with errors_in(f"the fleet {self.name}", FleetError):
             _checked({key: getattr(self, key) for key in _AT_START}, _FLEET)
             owners: dict[str, str] = {}
-            for name, place in ((name, place) for name, stream in self.streams.items() for place in stream.write):
-                if (owner := owners.setdefault(place, name)) != name and not place.startswith("http"):  # a webhook
-                    where = redacted(place)
+            for name, dest in ((name, dest) for name, stream in self.streams.items() for dest in stream.write):
+                if (owner := owners.setdefault(dest, name)) != name and not dest.startswith("http"):  # a webhook
+                    where = redacted(dest)
                     raise FleetError(f"the streams {owner} and {name} write to {where}: put {{stream}} into write")
 
     @classmethod

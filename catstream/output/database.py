@@ -57,17 +57,17 @@ class SqliteSink(Sink):
     that is logged, and a new one continues.
     """
 
-    def __init__(self, place: str, origin: Origin) -> None:
-        self._place, self._header, self._warnings = place, origin.header, Warnings(place)
+    def __init__(self, dest: str, origin: Origin) -> None:
+        self._dest, self._header, self._warnings = dest, origin.header, Warnings(dest)
         self._waiting: deque[TrackedFrame] = deque()
         self.missed = 0
         self._database: sqlite3.Connection | None = None
-        self._lock = open_locked(Path(place), VideoError, None)
+        self._lock = open_locked(Path(dest), VideoError, None)
         if origin.last is None:
             for part in ("", "-wal", "-shm"):
-                Path(f"{place}{part}").unlink(missing_ok=True)
+                Path(f"{dest}{part}").unlink(missing_ok=True)
             self._lock.close()
-            self._lock = open_locked(Path(place), VideoError)
+            self._lock = open_locked(Path(dest), VideoError)
         try:
             self._flush()
         except VideoError:
@@ -88,18 +88,18 @@ class SqliteSink(Sink):
             self._flush(_CLOSE_SECONDS)
             if lost := len(self._waiting) + self.missed:
                 raise VideoError(
-                    f"{self._place} lacks {counted(lost, 'frame')}, as another program locked it: if the run has an "
+                    f"{self._dest} lacks {counted(lost, 'frame')}, as another program locked it: if the run has an "
                     "NDJSON log, catstream export makes it again"
                 )
         finally:
-            with _errors(self._place), self._lock:
+            with _errors(self._dest), self._lock:
                 if self._database is not None:
                     self._database.close()
 
     def _flush(self, seconds: float = 0.0) -> None:
         """Write the frames that wait; a locked database is tried for some seconds."""
         try:
-            with _errors(self._place):
+            with _errors(self._dest):
                 self._follow()
                 self._database = self._database or self._connect()
                 self._database.execute(f"PRAGMA busy_timeout = {1000 * seconds:.0f}")
@@ -116,7 +116,7 @@ class SqliteSink(Sink):
 
     def _connect(self) -> sqlite3.Connection:
         with ExitStack() as stack:
-            database = stack.enter_context(closing(sqlite3.connect(self._place, timeout=0)))
+            database = stack.enter_context(closing(sqlite3.connect(self._dest, timeout=0)))
             database.execute("PRAGMA journal_mode = WAL")  # readers do not block the run
             database.execute("PRAGMA synchronous = NORMAL")
             with database:
@@ -126,7 +126,7 @@ class SqliteSink(Sink):
 
     def _follow(self) -> None:
         """Open a new file if another program has removed or renamed the file."""
-        path = Path(self._place)
+        path = Path(self._dest)
         if path.exists() and os.path.samestat(path.stat(), os.fstat(self._lock.fileno())):
             return
         self._warnings.log("removed or renamed by another program; the log goes on there without the rows before")
@@ -190,11 +190,11 @@ def _track(row: tuple[Any, ...]) -> Track:
 
 
 @contextmanager
-def _errors(place: str | Path, what: str = "write") -> Iterator[None]:
+def _errors(dest: str | Path, what: str = "write") -> Iterator[None]:
     try:
         yield
     except sqlite3.Error as error:
         if error.sqlite_errorcode & 0xFF in (sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED) and what == "write":
-            raise _LockedError(f"{place} is locked by another program: close it there") from None
+            raise _LockedError(f"{dest} is locked by another program: close it there") from None
         remedy = REMEDIES.get(_ERRNO.get(error.sqlite_errorcode & 0xFF, 0), "check the file")
-        raise VideoError(f"cannot {what} {str(place)!r} ({error}): {remedy}") from None
+        raise VideoError(f"cannot {what} {str(dest)!r} ({error}): {remedy}") from None

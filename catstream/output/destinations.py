@@ -157,9 +157,9 @@ class Origin:
 
 
 class Sink(ABC):
-    """Writes the frames in their order; created as `Class(place, origin)`.
+    """Writes the frames in their order; created as `Class(dest, origin)`.
 
-    Its class may have a function `check(place, options)`, which raises VideoError before the run if the address or an
+    Its class may have a function `check(dest, options)`, which raises VideoError before the run if the address or an
     option is not valid.
 
     missed  frames or messages that were dropped, as the destination was locked, slow or away
@@ -209,32 +209,32 @@ SINKS = {
 }
 
 
-def kind_of(place: str) -> str:
+def kind_of(dest: str) -> str:
     """Return the key of a destination in `SINKS`, or what would be its key.
 
     >>> kind_of("out/walk.csv"), kind_of("mqtt://host/yard"), kind_of("events/"), kind_of("-")
     ('.csv', 'mqtt://', '/', '-')
     """
-    scheme, mark, _ = place.partition("://")
-    if mark or place == STDOUT:
+    scheme, mark, _ = dest.partition("://")
+    if mark or dest == STDOUT:
         return scheme + mark
-    return "/" if place.endswith("/") else Path(place).suffix
+    return "/" if dest.endswith("/") else Path(dest).suffix
 
 
-def sink_of(place: str) -> Row:
+def sink_of(dest: str) -> Row:
     """Return the row of a destination; raises VideoError if there is none."""
-    row = SINKS.get(kind_of(place))
+    row = SINKS.get(kind_of(dest))
     if row is None:
         raise VideoError(
-            f"{redacted(place)} is not a destination of tracks: pass a file or address with one of {', '.join(SINKS)}, "
+            f"{redacted(dest)} is not a destination of tracks: pass a file or address with one of {', '.join(SINKS)}, "
             "where - is standard output, and / ends the name of a folder; for other formats use catstream export"
         )
     return row
 
 
-def is_file(place: str) -> bool:
+def is_file(dest: str) -> bool:
     """Return whether a destination is a file: not standard output, no address, and no folder."""
-    return place != STDOUT and "://" not in place and not place.endswith("/")
+    return dest != STDOUT and "://" not in dest and not dest.endswith("/")
 
 
 def check_result(path: Path, *, overwrite: bool, source: str = "", made: Path | None = None) -> None:
@@ -247,31 +247,31 @@ def check_result(path: Path, *, overwrite: bool, source: str = "", made: Path | 
     check_file(path, overwrite=overwrite, made=made, kind=VideoError, may_wait=is_live(source))
 
 
-def check_sink(place: str, options: SinkOptions, source: str = "") -> None:
+def check_sink(dest: str, options: SinkOptions, source: str = "") -> None:
     """Raise VideoError if there is no such destination, or the address or an option is invalid.
 
     Also if it is the video of a live `source`.
     """
-    home = sink_of(place).load()
-    if is_file(place) and place.endswith(".mp4") and is_live(source):
+    home = sink_of(dest).load()
+    if is_file(dest) and dest.endswith(".mp4") and is_live(source):
         raise VideoError(f"a video needs its frames once more, but {source} is live: omit the video")
     if hasattr(home, "check"):
-        home.check(place, options)
+        home.check(dest, options)
 
 
-def redacted(place: str) -> str:
+def redacted(dest: str) -> str:
     """Return a destination as messages name it: an address without its password, of a webhook its host alone.
 
     >>> redacted("mqtt://me:secret@10.0.0.7/yard"), redacted("https://example.com/hooks/T0/B0/secret")
     ('mqtt://10.0.0.7/yard', 'https://example.com/...')
     """
-    if is_file(place):
-        return place
-    address = without_password(place)
+    if is_file(dest):
+        return dest
+    address = without_password(dest)
     scheme, _, rest = address.partition("://")
     return f"{scheme}://{rest.partition('/')[0]}/..." if scheme in ("http", "https") else address
 
 
-def open_sink(place: str, origin: Origin) -> Sink:
+def open_sink(dest: str, origin: Origin) -> Sink:
     """Open the sink of a destination; raises VideoError if that is not possible."""
-    return cast(Sink, sink_of(place).load()(place, origin))
+    return cast(Sink, sink_of(dest).load()(dest, origin))

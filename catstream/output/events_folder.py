@@ -34,22 +34,22 @@ _LOG_BYTES = 10_000_000
 class EventsFolder(Sink):
     """Writes the files; a folder that cannot be written to is a warning, and the run continues."""
 
-    def __init__(self, place: str, origin: Origin) -> None:
-        self.check(place, origin.options)
-        self._folder, self._limit = Path(place), origin.options.megabytes * 1e6
-        self._events, self._warnings = EventStream(origin, has_pictures=True), Warnings(place)
+    def __init__(self, dest: str, origin: Origin) -> None:
+        self.check(dest, origin.options)
+        self._folder, self._limit = Path(dest), origin.options.megabytes * 1e6
+        self._events, self._warnings = EventStream(origin, has_pictures=True), Warnings(dest)
         self._tracks: dict[int, list[Track]] = {}  # by frame
         self._colours = Colours()
         ours = sorted(file for file in self._folder.iterdir() if _OURS.fullmatch(file.name))
         self._files = deque((file, file.stat().st_size) for file in ours)
 
     @staticmethod
-    def check(place: str, _: SinkOptions) -> None:
+    def check(dest: str, _: SinkOptions) -> None:
         """Make the folder; raise VideoError if that is not possible."""
         try:
-            Path(place).mkdir(parents=True, exist_ok=True)
+            Path(dest).mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise VideoError(f"cannot make the folder {place}: {error.strerror}") from None
+            raise VideoError(f"cannot make the folder {dest}: {error.strerror}") from None
 
     def write(self, frame: TrackedFrame) -> None:
         self._tracks.setdefault(frame.number, []).extend(frame.tracks)

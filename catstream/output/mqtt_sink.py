@@ -55,10 +55,10 @@ class MqttSink(Sink):
     missed  messages that were dropped; once it is closed, all that the broker has not acknowledged
     """
 
-    def __init__(self, place: str, origin: Origin) -> None:
-        url = _checked(place)
+    def __init__(self, dest: str, origin: Origin) -> None:
+        url = _checked(dest)
         self._topic, self._options = unquote(url.path)[1:], origin.options
-        self._events, self._warnings = EventStream(origin, has_pictures=origin.options.picture), Warnings(place)
+        self._events, self._warnings = EventStream(origin, has_pictures=origin.options.picture), Warnings(dest)
         self._availability, self._source = f"{self._topic}/availability", f"{self._topic}/source"
         self._source_state, self._deadline = "", 0.0  # state that was published; of the delivery, once it has ended
         self._sent: dict[str, tuple[object, float]] = {}  # of each object, the last status, and when the next is due
@@ -82,9 +82,9 @@ class MqttSink(Sink):
         self._publish(self._availability, "online", retain=True)
 
     @staticmethod
-    def check(place: str, _: SinkOptions) -> None:
+    def check(dest: str, _: SinkOptions) -> None:
         """Raise VideoError if this is no address of a broker with a topic."""
-        _checked(place)
+        _checked(dest)
 
     def write(self, frame: TrackedFrame) -> None:
         """Publish the events of a frame, and the states that have changed or are due."""
@@ -228,9 +228,9 @@ def _id(text: str) -> str:
     return blake2b(text.encode(), digest_size=8).hexdigest()
 
 
-def _checked(place: str) -> SplitResult:
+def _checked(dest: str) -> SplitResult:
     """The parts of the address; VideoError if it is not valid."""
-    url = split(place, "mqtt://[USER:PASSWORD@]HOST[:PORT]/TOPIC")
-    if url.path in ("", "/") or set("+#@") & set(unquote(url.path)) or set("?#") & set(place):
-        raise VideoError(f"{redacted(place)} has no valid topic: expected mqtt://HOST/TOPIC, without any of + # ? @")
+    url = split(dest, "mqtt://[USER:PASSWORD@]HOST[:PORT]/TOPIC")
+    if url.path in ("", "/") or set("+#@") & set(unquote(url.path)) or set("?#") & set(dest):
+        raise VideoError(f"{redacted(dest)} has no valid topic: expected mqtt://HOST/TOPIC, without any of + # ? @")
     return url

@@ -149,12 +149,12 @@ KEYS: dict[str, tuple[Any, str]] = {
 }
 
 
-def parse(values: Mapping[str, Any], places: Sequence[str], name_of: Callable[[str], str] = str) -> SinkOptions:
+def parse(values: Mapping[str, Any], destinations: Sequence[str], name_of: Callable[[str], str] = str) -> SinkOptions:
     """Return the options of destinations from values by the names in the table.
 
     SettingsError if a value is invalid or has no effect on these destinations; `name_of` is the name for the user.
     """
-    kinds, fields = {kind_of(place) for place in places}, {}
+    kinds, fields = {kind_of(dest) for dest in destinations}, {}
     for name, value in values.items():
         option = OPTIONS[name]
         if kinds.isdisjoint(option.users):
@@ -187,15 +187,15 @@ def destinations(
     def located(path: str) -> str:
         return f"{folder / path}/" if path.endswith("/") else str(folder / path)
 
-    named = dict.fromkeys(place.replace("{stream}", stream) for place in values.get("write", ()))
-    places = tuple(place if "://" in place or place == STDOUT else located(place) for place in named)
+    named = dict.fromkeys(dest.replace("{stream}", stream) for dest in values.get("write", ()))
+    destinations = tuple(dest if "://" in dest or dest == STDOUT else located(dest) for dest in named)
     given = {name: value for name, value in values.items() if name != "write"}
     if "secret_file" in given:
         given["secret_file"] = located(given["secret_file"].replace("{stream}", stream))
-    options = parse(given, places)
+    options = parse(given, destinations)
     with errors_in("write", SettingsError):
-        for place in places:
-            if place == STDOUT:
+        for dest in destinations:
+            if dest == STDOUT:
                 raise SettingsError("there is no standard output: pass a file or an address")
-            check_sink(place, options, without_password(source))
-    return places, options
+            check_sink(dest, options, without_password(source))
+    return destinations, options

@@ -40,8 +40,8 @@ class Warnings:
     So a receiver that alternates between two failures, or accepts and closes each connection, does not fill the log.
     """
 
-    def __init__(self, place: str) -> None:
-        self._address = redacted(place)
+    def __init__(self, dest: str) -> None:
+        self._address = redacted(dest)
         self.problems: dict[str, None] = {}  #: since it has worked, in order
         self._working_since: float | None = None
 
@@ -132,17 +132,17 @@ class EventStream:
         return json.dumps(fields).encode()
 
 
-def split(place: str, form: str) -> SplitResult:
+def split(dest: str, form: str) -> SplitResult:
     """Return the parts of an address; VideoError with its `form` and the defect, without its password."""
-    host = place.partition("://")[2].partition("/")[0]
+    host = dest.partition("://")[2].partition("/")[0]
     wrong = ""
-    if not all("!" <= letter <= "~" for letter in place):
+    if not all("!" <= letter <= "~" for letter in dest):
         wrong = "percent-encode spaces and letters outside ASCII, a space is %20"
-    elif "@" not in host and "@" in place:
+    elif "@" not in host and "@" in dest:
         wrong = "percent-encode a / in the user name or password, it is %2F"
     else:
         try:
-            url = urlsplit(place)
+            url = urlsplit(dest)
             if url.port != 0 and url.hostname and url.hostname.encode("idna"):
                 return url
             wrong = "the port has to be 1 to 65535" if url.port == 0 else "the host is missing"
@@ -150,7 +150,7 @@ def split(place: str, form: str) -> SplitResult:
             wrong = "the name of the host is not valid"
         except ValueError:
             wrong = "the port has to be 1 to 65535, an IPv6 address is in brackets"
-    raise VideoError(f"invalid address {redacted(place)} ({wrong}): expected {form}")
+    raise VideoError(f"invalid address {redacted(dest)} ({wrong}): expected {form}")
 
 
 def reason_of(error: BaseException | None) -> str:

@@ -72,8 +72,8 @@ class LineSink(Sink):
     be called again with the next frame: the file has no part of the frame before, and a header states the gap.
     """
 
-    def __init__(self, place: str, origin: Origin) -> None:
-        self.path, self._origin = Path(place), origin
+    def __init__(self, dest: str, origin: Origin) -> None:
+        self.path, self._origin = Path(dest), origin
         self._before = _FIRST if origin.last is None else _objects(origin.last)
         self._gap = origin.gap  # frames since the last one that was written
         self._is_rotated = False  # since the last one
@@ -401,7 +401,7 @@ def _objects(frame: TrackedFrame) -> frozenset[str]:
     return frozenset(track.object for track in frame.tracks)
 
 
-def places_of(name: str, results: Results) -> list[str]:
+def destinations_of(name: str, results: Results) -> list[str]:
     """Return the destinations of a run of this name, each once: the log in both forms, the video, and further ones."""
     kinds = ("ndjson", "csv", *(["mp4"] if results.video else []))
     own = [] if results.output is None else [str(results.output / f"{name}.{kind}") for kind in kinds]
@@ -417,12 +417,12 @@ class RunFiles:
 
     origin  the source of the run, and the frames that are tracked
     output  folder of the results, which is made if it does not exist; None for none
-    places  the destinations, each once
+    destinations  the destinations, each once
     """
 
     origin: Origin
     output: Path | None
-    places: list[str]
+    destinations: list[str]
 
     def check(self, *, overwrite: bool, earlier: list[str], others: Mapping[str, Path] | None = None) -> None:
         """Raise VideoError before the run if a destination cannot be written, or must not be.
@@ -431,15 +431,15 @@ class RunFiles:
         also the `others` that the run writes, by their purpose, have to be different.
         """
         source = self.origin.header.source
-        files = [(f"the destination {place}", Path(place)) for place in self.places if is_file(place)]
+        files = [(f"the destination {dest}", Path(dest)) for dest in self.destinations if is_file(dest)]
         check_distinct([*files, *(others or {}).items()], VideoError)
-        for place in self.places:
-            check_sink(place, self.origin.options, source)
-            if is_file(place):
-                continued = place in earlier and self._log() is not None
-                if place in earlier and not continued and Path(place).exists():
-                    raise VideoError(f"{place} cannot be continued: pass other destinations to resume (--write DEST)")
-                check_result(Path(place), overwrite=overwrite or continued, source=source, made=self.output)
+        for dest in self.destinations:
+            check_sink(dest, self.origin.options, source)
+            if is_file(dest):
+                continued = dest in earlier and self._log() is not None
+                if dest in earlier and not continued and Path(dest).exists():
+                    raise VideoError(f"{dest} cannot be continued: pass other destinations to resume (--write DEST)")
+                check_result(Path(dest), overwrite=overwrite or continued, source=source, made=self.output)
 
     def position(self, *, skip_damaged: bool = False) -> tuple[int | None, float]:
         """Return the number of the frame after the last whole one of the log, and the seconds of that one.
@@ -453,20 +453,20 @@ class RunFiles:
 
     def missing(self) -> list[str]:
         """Return the files that do not exist, as another program has removed them."""
-        return [place for place in self.places if is_file(place) and not Path(place).exists()]
+        return [dest for dest in self.destinations if is_file(dest) and not Path(dest).exists()]
 
     def is_complete(self, frames: int | None) -> bool:
         """Return whether all destinations, at least one, are files that have this number of frames, None if unknown."""
 
-        def count(place: str) -> int | None:
-            if is_log(Path(place)):
-                last, _ = Log(Path(place), skip_damaged=True).last_whole_frame()
+        def count(dest: str) -> int | None:
+            if is_log(Path(dest)):
+                last, _ = Log(Path(dest), skip_damaged=True).last_whole_frame()
                 return last and last.number + 1
-            with suppress(VideoError), open_source(place) as video:
+            with suppress(VideoError), open_source(dest) as video:
                 return video.frames
             return None
 
-        return frames is not None and {*map(count, self.places)} == {frames}
+        return frames is not None and {*map(count, self.destinations)} == {frames}
 
     def opened(self, endpoint: str, *, resume: bool = False, skip_damaged: bool = False) -> OpenFiles:
         """Open all destinations beside a pipeline; existing files are replaced.
@@ -478,16 +478,16 @@ class RunFiles:
         log = None if path is None else Log(path, skip_damaged=skip_damaged)
         last, size = (None, 0) if log is None else log.last_whole_frame()
         log_origin = replace(origin, last=last, size=size)
-        origins = {place: log_origin if Path(place) == path else origin for place in self.places}
+        origins = {dest: log_origin if Path(dest) == path else origin for dest in self.destinations}
         with ExitStack() as stack:
             outputs = stack.enter_context(OpenFiles(origins, is_live=is_live(origin.header.source)))
-            for place in self.places:
-                outputs.write_to(place)
+            for dest in self.destinations:
+                outputs.write_to(dest)
             # The other files are made again from the log.
-            followers = [place for place in self.places if is_file(place) and Path(place) != path]
+            followers = [dest for dest in self.destinations if is_file(dest) and Path(dest) != path]
             for frame in log if log is not None and last is not None and followers else ():
-                for place in followers:
-                    outputs.write_to(place, frame)
+                for dest in followers:
+                    outputs.write_to(dest, frame)
             stack.pop_all()
         return outputs
 
@@ -496,17 +496,17 @@ class RunFiles:
 
         walk.ndjson becomes walk-20261128T133015.ndjson, by the time of its last change.
         """
-        for place in map(Path, filter(is_file, self.places)):
-            with writing(place, VideoError):
-                place.parent.mkdir(parents=True, exist_ok=True)
-                if place.is_file() and not (resume and self._log() is not None):
-                    place.rename(_with_time(place, place.stat().st_mtime))
+        for dest in map(Path, filter(is_file, self.destinations)):
+            with writing(dest, VideoError):
+                dest.parent.mkdir(parents=True, exist_ok=True)
+                if dest.is_file() and not (resume and self._log() is not None):
+                    dest.rename(_with_time(dest, dest.stat().st_mtime))
         self.check(overwrite=True, earlier=[])
         return self.opened(endpoint, resume=resume)
 
     def _log(self) -> Path | None:
         """Return the log that is continued, None if there is to be none."""
-        logs = (Path(place) for place in self.places if is_log(Path(place)))
+        logs = (Path(dest) for dest in self.destinations if is_log(Path(dest)))
         return min(logs, key=lambda log: (not log.exists(), LOGS.index(log.suffix)), default=None)
 
 
@@ -540,20 +540,20 @@ class OpenFiles(AbstractContextManager["OpenFiles"]):
         """Write a frame everywhere."""
         if self._is_live:
             self._rotate()
-        written = [self.write_to(place, frame) for place in self._origins]
+        written = [self.write_to(dest, frame) for dest in self._origins]
         if all(written):
             self._warnings.working()
         else:
             self.not_written += 1
 
-    def write_to(self, place: str, frame: TrackedFrame | None = None) -> bool:
+    def write_to(self, dest: str, frame: TrackedFrame | None = None) -> bool:
         """Open a destination if it is not open, and write a frame to it; return whether that was possible."""
         try:
-            if place not in self._sinks:
-                sink = open_sink(place, replace(self._origins[place], gap=self.not_written))
-                self._sinks[place] = self._stack.enter_context(closing(sink))
+            if dest not in self._sinks:
+                sink = open_sink(dest, replace(self._origins[dest], gap=self.not_written))
+                self._sinks[dest] = self._stack.enter_context(closing(sink))
             if frame is not None:
-                self._sinks[place].write(frame)
+                self._sinks[dest].write(frame)
         except VideoError as error:
             if not self._is_live:
                 raise

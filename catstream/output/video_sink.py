@@ -16,15 +16,15 @@ from catstream.wire.messages import Preview, Track
 _BACKLOG = 256  # frames whose tracks wait for their picture
 
 
-def open_video(place: str, origin: Origin) -> Sink:
+def open_video(dest: str, origin: Origin) -> Sink:
     """Open an MP4 of the frames of a source if they can be read a second time, else of the pipeline's pictures."""
-    return PictureVideo(place, origin) if origin.attached else SourceVideo(place, origin.header)
+    return PictureVideo(dest, origin) if origin.attached else SourceVideo(dest, origin.header)
 
 
 class SourceVideo(Sink):
     """An MP4 of the frames that have a track, with their tracks drawn in."""
 
-    def __init__(self, place: str, header: Header) -> None:
+    def __init__(self, dest: str, header: Header) -> None:
         # The pipeline skips damaged frames and scales others, or ends at the first: in any case these are its frames.
         part = slice(header.start, None, header.stride)
         self._frames = open_source(
@@ -34,7 +34,7 @@ class SourceVideo(Sink):
         try:
             aspect = self._frames.pixel_aspect
             size, rate = drawn_size(self._frames.size), self._frames.rate
-            self._video = VideoWriter(place, rate, size, pixel_aspect=aspect)
+            self._video = VideoWriter(dest, rate, size, pixel_aspect=aspect)
         except VideoError:
             self._frames.close()
             raise
@@ -54,8 +54,8 @@ class SourceVideo(Sink):
 class PictureVideo(Sink):
     """An MP4 of the small pictures that a running pipeline sends, with their tracks drawn in, at their true times."""
 
-    def __init__(self, place: str, origin: Origin) -> None:
-        self._place, self._colours = place, Colours()
+    def __init__(self, dest: str, origin: Origin) -> None:
+        self._dest, self._colours = dest, Colours()
         self._previews = subscribe(origin.address, "previews", timeout=0)
         self._tracks: dict[int, list[Track]] = {}  # of the newest frames, by the number of the frame
         self._picture: Preview | None = None  # not drawn yet: its frame may have further tracks
@@ -77,13 +77,11 @@ class PictureVideo(Sink):
         if image is not None:
             self._colours.keep(track.object for track in tracks)
             size = (image.shape[1], image.shape[0])
-            self._video = self._video or VideoWriter(self._place, RATE, size)
+            self._video = self._video or VideoWriter(self._dest, RATE, size)
             self._video.write(image, tracks[0].time)
 
     def close(self) -> None:
         self._previews.close()
         if self._video is None:
-            raise VideoError(
-                f"{self._place} was not written: the pipeline sent no picture of a frame that was received"
-            )
+            raise VideoError(f"{self._dest} was not written: the pipeline sent no picture of a frame that was received")
         self._video.close()

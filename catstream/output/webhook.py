@@ -39,9 +39,9 @@ class Webhook(Sink):
     missed  events that were dropped, because too many waited; once it is closed, all that were not delivered
     """
 
-    def __init__(self, place: str, origin: Origin) -> None:
-        self._url, self._key = split(place, _FORM), _key(origin.options)
-        self._events, self._warnings = EventStream(origin, has_pictures=origin.options.picture), Warnings(place)
+    def __init__(self, dest: str, origin: Origin) -> None:
+        self._url, self._key = split(dest, _FORM), _key(origin.options)
+        self._events, self._warnings = EventStream(origin, has_pictures=origin.options.picture), Warnings(dest)
         self._bodies: SimpleQueue[bytes | None] = SimpleQueue()
         self._count = self._delivered = self.missed = 0
         self._hurry, self._closed = Flag(), False  # the event ends a pause
@@ -51,9 +51,9 @@ class Webhook(Sink):
         self._thread.start()
 
     @staticmethod
-    def check(place: str, options: SinkOptions) -> None:
+    def check(dest: str, options: SinkOptions) -> None:
         """Raise VideoError if this is no address, or the key cannot be read."""
-        split(place, _FORM)
+        split(dest, _FORM)
         _key(options)
 
     def write(self, frame: TrackedFrame) -> None:

@@ -60,9 +60,9 @@ def test_a_database_alone_is_continued_after_the_last_frame_of_a_run_that_was_ki
     killed = subprocess.run([sys.executable, "-P", "-c", KILLED, path, log], check=False)
     assert killed.returncode == -signal.SIGKILL
     run = RunFiles(Origin(), None, [str(path)])
-    run.check(overwrite=False, earlier=run.places)
+    run.check(overwrite=False, earlier=run.destinations)
     assert run.position()[0] == 2
-    more = replace(run, places=[*run.places, str(tmp_path / "t.ndjson")])
+    more = replace(run, destinations=[*run.destinations, str(tmp_path / "t.ndjson")])
     with more.opened("", resume=True) as files:
         assert read(path) == read(tmp_path / "t.ndjson") == [[each] for each in TRACKS[:2]]
         files.write(TrackedFrame(TRACKS[2:]))
@@ -76,7 +76,7 @@ def test_a_run_that_was_killed_before_its_database_had_a_table_continues(tmp_pat
     with closing(sqlite3.connect(path)) as database:
         database.execute(begun)
     run = RunFiles(Origin(), None, [str(path)])
-    run.check(overwrite=False, earlier=run.places)
+    run.check(overwrite=False, earlier=run.destinations)
     assert run.position()[0] == 0
     with run.opened("", resume=True) as files:
         files.write(TrackedFrame(TRACKS[:1]))

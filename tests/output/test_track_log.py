@@ -24,7 +24,7 @@ from catstream.base.files import REMEDIES
 from catstream.errors import VideoError
 from catstream.output import remote, track_log
 from catstream.output.destinations import Header, Origin, Rotation, SinkOptions, TrackedFrame, open_sink
-from catstream.output.track_log import JoinedLog, Log, RunFiles, places_of
+from catstream.output.track_log import JoinedLog, Log, RunFiles, destinations_of
 from catstream.processes.job import Results
 from catstream.video.rendered import write
 from catstream.video.source import open_source
@@ -239,7 +239,7 @@ def test_a_new_file_whose_first_line_the_disk_does_not_take_is_not_left(disk):
 def run_in(folder, *more):
     """The files of a run in a folder."""
     output = folder / "out"
-    places = [*places_of("walk", Results(output, False)), *(str(folder / name) for name in more)]
+    places = [*destinations_of("walk", Results(output, False)), *(str(folder / name) for name in more)]
     return RunFiles(Origin(), output, places)
 
 
@@ -253,8 +253,9 @@ def add(run, history, first=0, resume=False):
 
 def rows_of(run):
     """The rows of all logs, without the processing times, which a log that was cut may lack."""
-    return {Path(place).name: [line.rpartition("," if place.endswith("csv") else "}")[0]
-            for line in Path(place).read_text().splitlines()] for place in run.places if place[-1] != "4"}  # fmt: skip
+    logs = [Path(dest) for dest in run.destinations if not dest.endswith(".mp4")]
+    ends = {path: "," if path.suffix == ".csv" else "}" for path in logs}
+    return {path.name: [line.rpartition(ends[path])[0] for line in path.read_text().splitlines()] for path in logs}
 
 
 #: The objects of each frame: a few come, go and come again.
@@ -269,10 +270,10 @@ def test_wherever_a_crash_cuts_the_files_no_row_is_lost_or_doubled(history, data
         whole, broken = run_in(Path(place) / "whole", "../t.csv"), run_in(Path(place) / "broken")
         add(whole, history)
         add(broken, history)
-        for log in broken.places:
+        for log in broken.destinations:
             size = Path(log).stat().st_size
             os.truncate(log, size - data.draw(st.integers(0, size)))
-        again = replace(broken, places=[*broken.places, str(Path(place) / "t.csv")])  # a file that is new
+        again = replace(broken, destinations=[*broken.destinations, str(Path(place) / "t.csv")])  # a file that is new
         add(again, history, broken.position()[0], resume=True)
         assert rows_of(again) == rows_of(whole)
 
@@ -283,13 +284,13 @@ def test_existing_files_are_replaced_on_request_and_continued_by_their_own_run_o
     with pytest.raises(VideoError, match=r"walk\.ndjson exists already: replace it with --overwrite"):
         run.check(overwrite=False, earlier=[])
     run.check(overwrite=True, earlier=[])
-    run.check(overwrite=False, earlier=run.places)
+    run.check(overwrite=False, earlier=run.destinations)
     with pytest.raises(VideoError, match=r"t\.csv exists already"):
-        run.check(overwrite=False, earlier=run.places[:2])
+        run.check(overwrite=False, earlier=run.destinations[:2])
     video = RunFiles(Origin(), None, [str(tmp_path / "t.mp4")])  # which is not a log
     (tmp_path / "t.mp4").touch()
     with pytest.raises(VideoError, match=r"t\.mp4 cannot be continued: pass other destinations to resume"):
-        video.check(overwrite=False, earlier=video.places)
+        video.check(overwrite=False, earlier=video.destinations)
 
 
 @pytest.mark.parametrize(
