@@ -190,7 +190,8 @@ def assign(detections: Mapping[str, Detection], states: Mapping[str, DetectorSta
     assigned = {name: box for name, box in boxes.items() if name not in conflicts}
     result = dict(detections)
     for name in sorted(conflicts, key=lambda name: (name in certain, loss[name]), reverse=True):
-        if in_conflict(name, assigned):
+        taken = [assigned[other] for other in exclusive[name] if other in assigned]  # also by one with a lower score
+        if in_conflict(name, assigned) or any(_conflict(boxes[name], box) for box in taken):
             # Neither at an assigned position, nor at one that a later object may be assigned.
             result[name] = elsewhere(name, boxes | assigned)
         if result[name].score > 0:

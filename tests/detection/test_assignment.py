@@ -33,6 +33,13 @@ def detection(score, x, around=None):
     return Detection(score, Window.around(Box(x, 50, 40, 40)), around)
 
 
+def scores_around(x, beside):
+    """Scores of 0.1, but for the windows 25 pixels to the left."""
+    scores = np.full((3, 9), 0.1, np.float32)
+    scores[:, 0] = beside
+    return ScoreMap(None, scores, (x - 25.0, 45.0), (5.0, 5.0))
+
+
 def test_detections_at_different_places_stay_the_same():
     detections = {"anna": detection(0.9, 100), "ben": detection(0.8, 120)}
     assert assign(detections, APART) == detections
@@ -75,6 +82,16 @@ def test_no_two_objects_ever_have_one_place(objects, random):
     assert all(one.overlap(other) <= 0.5 for one, other in combinations(boxes, 2))
 
 
+def test_an_object_gives_way_to_an_assigned_one_of_lower_score():
+    detections = {
+        "anna": detection(0.8, 108, scores_around(108, 0.1)),
+        "ben": detection(0.8, 108, scores_around(108, 0.55)),
+        "carl": detection(0.7, 112, scores_around(112, 0.55)),  # would lose most
+    }
+    result = assign(detections, dict.fromkeys(detections, replace(state(20), level="weak")))
+    assert [name for name, each in result.items() if each is detections[name]] == ["carl"]
+
+
 def test_objects_that_are_together_may_stay_at_one_place():
     detections = {"anna": detection(0.9, 100), "ben": detection(0.8, 104)}
     later = state(110, first_frame=7)
@@ -100,13 +117,10 @@ def test_an_uncertain_object_gets_no_part_of_the_place_of_another(side, score, l
 @pytest.mark.parametrize(("score", "winner"), [(0.6, "anna"), (1.0, "anna"), (1.2, "ben")])
 def test_an_uncertain_object_displaces_a_certain_one_only_with_a_clearly_higher_score(score, winner):
     """The certain one has nearly as good a window beside it, so its score would fall less."""
-
-    def around(x, beside):
-        scores = np.full((3, 9), 0.1, np.float32)
-        scores[:, 0] = beside
-        return ScoreMap(None, scores, (x - 25.0, 45.0), (5.0, 5.0))
-
-    detections = {"anna": detection(0.7, 100, around(100, 0.65)), "ben": detection(score, 104, around(104, 0.1))}
+    detections = {
+        "anna": detection(0.7, 100, scores_around(100, 0.65)),
+        "ben": detection(score, 104, scores_around(104, 0.1)),
+    }
     result = assign(detections, APART | {"ben": replace(APART["ben"], level="redetected")})
     assert result[winner] is detections[winner]
     assert [name for name in detections if result[name] is detections[name]] == [winner]
