@@ -54,6 +54,8 @@ class StreamSubscription(Subscription[Message]):
 
     def _pipeline_ended(self, end: End, seconds: float) -> None:  # noqa: ARG002  # it may continue elsewhere
         self._pipeline_end, self._next_question = self._pipeline_end or end, monotonic()
+        if self.end is not None and self._status.state == "ended":  # the answer of the registry was received first
+            self.end = self._pipeline_end
 
     def _look_for_pipeline(self) -> None:
         """Ask the registry if it is time to, and take its answer if it has arrived."""

@@ -119,6 +119,7 @@ class Subscription(Generic[Message]):
         self._open = partial(_Connection, self._channel, None if object is None else check_name(object), newest)
         self._connection: _Connection | None = None
         self._close_time = float("inf")  # until which messages may still arrive after the end
+        self._is_over = False  # whether none had arrived at a look after that time
         self._clock = RunningClock()  # of the timeout
         self._has_run = endpoint is not None and not endpoint.lacks_sockets()  # whether the pipeline was there before
         self._closed = False
@@ -182,7 +183,7 @@ class Subscription(Generic[Message]):
     def __next__(self) -> Message:
         deadline = self._deadline()
         while (message := self._take(deadline)) is None:
-            if self._is_over():
+            if self._is_over:
                 raise StopIteration
             self._poller(zmq.Poller()).poll(self._milliseconds(deadline))
         return message
@@ -193,7 +194,7 @@ class Subscription(Generic[Message]):
     async def __anext__(self) -> Message:
         deadline = self._deadline()
         while (message := self._take(deadline)) is None:
-            if self._is_over():
+            if self._is_over:
                 raise StopAsyncIteration
             await self._poller(zmq.asyncio.Poller()).poll(self._milliseconds(deadline))
         return message
@@ -217,24 +218,20 @@ class Subscription(Generic[Message]):
         remaining = self._close_time - monotonic() if self.end is not None else deadline - self._clock()
         return 1000 * max(0.0, min(remaining, CHECK_SECONDS))
 
-    def _is_over(self) -> bool:
-        """Whether the iteration ends now; what has not arrived of the frames before the end is then missed."""
-        if self.end is None or monotonic() < self._close_time:
-            return False
-        if self._channel.keeps == "every":
-            with self._turn:
-                self._gaps.end(self.end)
-        return True
-
     def _take(self, deadline: float) -> Message | None:
         """The next message if one has arrived, without waiting; also runs periodic housekeeping."""
         check_not_forked(self._generation)  # first: another thread of the original may have held the lock
         with self._turn:
             if self._closed:
                 raise ServiceError("the subscription is closed (perhaps by another thread or task): create a new one")
+            is_late = monotonic() >= self._close_time  # before the look: this thread may have been suspended
             if (message := self._receive()) is not None:
                 self._has_run = True
                 return message
+            if is_late and self.end is not None:
+                self._is_over = True
+                if self._channel.keeps == "every":
+                    self._gaps.end(self.end)  # the frames before it that have not arrived are missed
             if self.end is None:
                 self._look_for_pipeline()
             if self.end is None:

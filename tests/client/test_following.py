@@ -82,6 +82,17 @@ def test_frames_lost_before_the_end_are_missed_if_the_wait_ends_between_two_chec
             assert tracks.missed == 99 - 2
 
 
+def test_a_stream_whose_end_arrives_after_that_of_its_pipeline_was_registered_ends_with_it(stream, managing):
+    with managing(stream.status):
+        first = stream.runs()
+        with catstream.subscribe("fleet://cam-7", "tracks", timeout=150) as tracks:
+            stream.send(first, track(1), STOPPED)
+            stream.update(state="ended")
+            tracks._update(stream.status.streams["cam-7"])  # before anything is read
+            assert list(tracks) == [track(1)]
+            assert (tracks.end, tracks.missed) == (STOPPED, 99 - 2)
+
+
 def test_frames_that_were_lost_between_two_nodes_are_counted_as_missed(stream, managing):
     with managing(stream.status):
         first = stream.runs()

@@ -1,10 +1,9 @@
 """Attached to a pipeline: what a reader gets, what it is told that it missed, and when it ends."""
 
 import asyncio
-import contextlib
-import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from itertools import chain, repeat
 
 import numpy as np
 import pytest
@@ -34,25 +33,22 @@ def tracks(endpoint):
         yield publisher
 
 
-def attached(endpoint, tracks, channel="tracks", **options):
-    """A subscription to which the publisher of tracks is connected: it got the track with seq 1."""
-    subscription = catstream.subscribe(str(endpoint), channel, timeout=0.05, **options)
-    for _ in range(400):
+@pytest.fixture
+def attached(endpoint, tracks, until):
+    """Makes a subscription to which the publisher of tracks is connected: it got the track with seq 1."""
+
+    def subscribe(**options):
+        subscription = catstream.subscribe(str(endpoint), "tracks", timeout=60, **options)
+        until(lambda: len(tracks._subscribed) == 2, tracks.serve_late_joiners)  # the end has a connection of its own
         tracks.send(track(1, options.get("object", "")))
-        with contextlib.suppress(SilenceError):
-            assert next(subscription).seq == 1
-            break
-    for _ in range(400):  # those of the same seq that were on their way
-        with contextlib.suppress(SilenceError):
-            next(subscription)
-            continue
-        break
-    subscription.timeout = 20
-    return subscription
+        assert next(subscription).seq == 1
+        return subscription
+
+    return subscribe
 
 
-def test_a_closed_subscription_ends_its_loops_with_an_error_in_other_threads_too(endpoint, tracks):
-    with attached(endpoint, tracks) as subscription, ThreadPoolExecutor() as pool:
+def test_a_closed_subscription_ends_its_loops_with_an_error_in_other_threads_too(attached):
+    with attached() as subscription, ThreadPoolExecutor() as pool:
         loop = pool.submit(list, subscription)
         subscription.close()
         with pytest.raises(ServiceError, match="the subscription is closed"):
@@ -66,8 +62,8 @@ def test_a_closed_subscription_ends_its_loops_with_an_error_in_other_threads_too
     [(tuple(range(2, 50)), 50, 0), ((2, 5, 6, 10), 13, 2 + 3 + 2), ((2, 3, 4, 2, 3, 4, 5), 6, 0)],
     ids=["all", "gaps, also before the end", "repeated by a restarted detector"],
 )
-def test_tracks_arrive_in_order_until_the_end_and_each_gap_is_counted(endpoint, tracks, seqs, end, missed):
-    with attached(endpoint, tracks) as subscription:
+def test_tracks_arrive_in_order_until_the_end_and_each_gap_is_counted(tracks, attached, seqs, end, missed):
+    with attached() as subscription:
         for seq in seqs:
             tracks.send(track(seq))
         tracks.send(End(end - 1, "the source has ended", totals={"sent": 49.0}))
@@ -76,9 +72,9 @@ def test_tracks_arrive_in_order_until_the_end_and_each_gap_is_counted(endpoint, 
         assert list(subscription) == [], "it stays ended"
 
 
-def test_the_tracks_of_several_objects_in_a_frame_are_no_gap_and_no_repeat(endpoint, tracks):
+def test_the_tracks_of_several_objects_in_a_frame_are_no_gap_and_no_repeat(tracks, attached):
     said = [("anna", 2), ("ben", 2), ("ben", 3), ("anna", 3), ("carl", 3), ("anna", 6), ("anna", 7), ("ben", 7)]
-    with attached(endpoint, tracks) as subscription:
+    with attached() as subscription:
         for name, seq in said:
             tracks.send(track(seq, name))
         tracks.send(End(7, "the source has ended"))
@@ -87,8 +83,8 @@ def test_the_tracks_of_several_objects_in_a_frame_are_no_gap_and_no_repeat(endpo
 
 
 @pytest.mark.parametrize("name", ["ann", ""])
-def test_a_subscriber_to_one_object_receives_no_track_of_a_name_with_the_same_prefix(endpoint, tracks, name):
-    with attached(endpoint, tracks, object=name) as subscription:
+def test_a_subscriber_to_one_object_receives_no_track_of_a_name_with_the_same_prefix(tracks, attached, name):
+    with attached(object=name) as subscription:
         for seq in range(2, 20):
             for each in ("anna", "ann", "", "an", "annas" * 12):
                 tracks.send(track(seq, each))
@@ -139,9 +135,9 @@ def small_buffers(monkeypatch):
 
 
 @pytest.mark.usefixtures("small_buffers")
-def test_a_subscriber_whose_end_message_was_dropped_still_ends(endpoint, tracks):
+def test_a_subscriber_whose_end_message_was_dropped_still_ends(tracks, attached):
     count = 10_000  # more than all buffers on the way hold
-    with attached(endpoint, tracks) as subscription:
+    with attached() as subscription:
         for seq in range(2, count):
             tracks.send(track(seq))
         tracks.send(End(count - 1, "the source has ended"))
@@ -166,6 +162,26 @@ def test_a_late_subscriber_gets_the_last_model_once_and_ends_with_the_tracks(end
                 seen.append(message.version)
     assert seen == [2]
     assert subscription.end.reason == "the source has ended"
+
+
+def test_a_message_that_arrives_while_a_reader_is_suspended_at_the_end_is_read(endpoint, tracks, until, monkeypatch):
+    monkeypatch.setattr("catstream.client.subscription.DRAIN_SECONDS", 0.0)
+    with (
+        Publisher(MODELS, endpoint) as models,
+        catstream.subscribe(str(endpoint), "models", timeout=60) as subscription,
+    ):
+        until(lambda: models.has_subscribers, models.serve_late_joiners)
+        until(lambda: tracks._subscribed, tracks.serve_late_joiners)
+        tracks.send(End(1, "the source has ended"))
+        messages, ends = subscription._connection.messages, subscription._connection.ends
+
+        def late(_, receive=ends.receive):  # the model arrives after the look for messages
+            models.send(model(1))
+            until(messages.pending)
+            return receive(60)
+
+        monkeypatch.setattr(ends, "receive", late)
+        assert [message.version for message in subscription] == [1]
 
 
 def test_features_are_copied_to_all_subscribers_and_missing_ones_are_counted(endpoint, until):
@@ -198,17 +214,19 @@ def test_iteration_may_continue_after_a_timeout_and_the_end_counts_missed_frames
         assert subscription.losses() == "60 missed, 60 of them before this subscriber connected"
 
 
-def test_the_reason_of_a_silence_names_an_object_that_the_run_lacks(endpoint, turning):
+def test_the_reason_of_a_silence_names_an_object_that_the_run_lacks(endpoint, turning, monkeypatch):
     with (
         Publisher(HEALTH, endpoint, "detector") as health,
         catstream.subscribe(str(endpoint), "tracks", object="ben", timeout=2) as subscription,
     ):
+        ticks = chain([0.0], repeat(1.0))  # until there is a report
+        monkeypatch.setattr(subscription, "_clock", lambda: 9.0 if subscription._connection.state else next(ticks))
         health.send(Health("detector", 1.0, {}, objects={"anna": {}}))
         with turning(health.serve_late_joiners), pytest.raises(SilenceError, match="running, without an object 'ben'"):
             next(subscription)
 
 
-def test_async_for_gives_the_same_and_may_be_cancelled(endpoint, tracks):
+def test_async_for_gives_the_same_and_may_be_cancelled(tracks, attached):
     async def read(subscription):
         return [message.seq async for message in subscription]
 
@@ -218,7 +236,7 @@ def test_async_for_gives_the_same_and_may_be_cancelled(endpoint, tracks):
         subscription.timeout = 0.05
         with pytest.raises(SilenceError):
             await anext(subscription)
-        subscription.timeout = 20
+        subscription.timeout = 60
         reading = asyncio.create_task(read(subscription))
         for seq in range(2, 40):
             tracks.send(track(seq))
@@ -226,7 +244,7 @@ def test_async_for_gives_the_same_and_may_be_cancelled(endpoint, tracks):
         tracks.send(End(41, "the source has ended"))
         return await reading
 
-    with attached(endpoint, tracks) as subscription:
+    with attached() as subscription:
         assert asyncio.run(both()) == list(range(2, 40))
         assert subscription.missed == 2
 
@@ -241,8 +259,8 @@ def test_a_subscriber_ends_if_the_sockets_of_its_pipeline_are_gone_from_the_fold
         assert "did not receive its end" in subscription.end.reason
 
 
-def test_a_reader_that_is_slow_knows_how_old_its_tracks_are(endpoint, tracks, until):
-    with Publisher(HEALTH, endpoint, "detector") as health, attached(endpoint, tracks) as subscription:
+def test_a_reader_that_is_slow_knows_how_old_its_tracks_are(endpoint, tracks, attached, until):
+    with Publisher(HEALTH, endpoint, "detector") as health, attached() as subscription:
         assert subscription.behind == 0, "there was no report"
         health.send(Health("detector", 1.0, {"time": 12.5}))
         tracks.send(replace(track(2), time=0.4))
@@ -254,14 +272,16 @@ def test_a_reader_that_is_slow_knows_how_old_its_tracks_are(endpoint, tracks, un
         assert subscription.behind == 0
 
 
-def test_newest_subscription_yields_the_last_track_of_each_object_and_the_end(endpoint, tracks):
-    with attached(endpoint, tracks, newest=True) as subscription:
+def test_newest_subscription_yields_the_last_track_of_each_object_and_the_end(tracks, attached):
+    with attached(newest=True) as subscription:
+        heard = []
         for seq in range(2, 50):
             for name in ("anna", "ben"):
                 tracks.send(track(seq, name))
+            if seq % 8 == 0:
+                heard.append(next(subscription))
         tracks.send(End(49, "the source has ended"))
-        time.sleep(0.2)  # many of them are here
-        heard = [(message.object, message.seq) for message in subscription]
+        heard = [(message.object, message.seq) for message in (*heard, *subscription)]
     assert dict(heard) == {"anna": 49, "ben": 49}
     assert len(heard) < 2 * 48
     assert subscription.missed > 0
