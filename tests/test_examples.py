@@ -52,7 +52,7 @@ def beside(demo_video):
             process = started(stack, example, *(pipeline.endpoint if word == "ENDPOINT" else word for word in words))
             for track in pipeline:
                 tracks[track.frame] = track
-                speaks = speaks or select.select([process.stdout], [], [], 0.3)[0]  # while it starts, few frames pass
+                speaks = speaks or select.select([process.stdout], [], [], 2)[0]  # while it starts, few frames pass
             printed, _ = process.communicate(timeout=150)
         assert process.returncode == 0
         return tracks, printed.splitlines()
@@ -131,7 +131,7 @@ def test_a_ground_station_selects_an_object_and_is_told_where_it_is(demo_video, 
         corners = x / 320, y / 240, (x + w) / 320, (y + h) / 240
         assert result_of("CAMERA_TRACK_RECTANGLE", *corners) == mavlink.MAV_RESULT_ACCEPTED
         for _ in pipeline:
-            found = link.recv_match(type="CAMERA_TRACKING_IMAGE_STATUS", blocking=True, timeout=0.1)
+            found = link.recv_match(type="CAMERA_TRACKING_IMAGE_STATUS", blocking=True, timeout=2)
             if found is not None and found.tracking_status == mavlink.CAMERA_TRACKING_STATUS_FLAGS_ACTIVE:
                 break
         assert (found.rec_top_x, found.rec_top_y) == pytest.approx(corners[:2], abs=0.1)

@@ -74,4 +74,4 @@ def test_workers_end_with_a_process_that_is_killed():
     )
     killed = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     worker = int(killed.stdout)
-    assert not psutil.pid_exists(worker) or not psutil.wait_procs([psutil.Process(worker)], timeout=10)[1]
+    assert not psutil.pid_exists(worker) or not psutil.wait_procs([psutil.Process(worker)], timeout=150)[1]

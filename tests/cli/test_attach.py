@@ -38,7 +38,7 @@ def test_watch_prints_tracks_as_json_lines_until_the_end_and_features_as_lines(l
         tracks = catstream("watch", "tracks", "--json", *place)
         for _ in running:
             for watcher in (features, tracks):
-                select.select([watcher.stdout], [], [], 0.3)  # while it starts, few pass
+                select.select([watcher.stdout], [], [], 1)  # while it starts, few pass
         shown, _ = features.communicate(timeout=SECONDS)
         output, errors = tracks.communicate(timeout=SECONDS)
     found = [json.loads(line) for line in output.splitlines()]

@@ -29,10 +29,10 @@ class Run:
 
     def until(self, condition):
         """Wait until the detector's counters are so."""
-        for report, _ in zip(self._health, range(180), strict=False):
+        for report in self._health:
             if report.process == "detector" and condition(report.counters):
                 return report.counters
-        raise AssertionError(f"it did not happen in time: {self.process.poll()}")
+        raise AssertionError(f"the run has ended: {self.process.poll()}")
 
     def stopped(self):
         """Its rows and what it said, after Ctrl-C."""

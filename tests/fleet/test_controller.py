@@ -297,13 +297,17 @@ def test_a_restarted_controller_waits_for_its_store(made, ray, spec, monkeypatch
     assert sorted(again.status().streams) == ["gate", "roof"]
 
 
-def test_a_stream_that_is_not_placed_or_silent_is_reported_long_before_its_restart(site, ray, monkeypatch):
+def test_a_stream_that_is_not_placed_or_silent_is_reported_long_before_its_restart(made, spec, ray, monkeypatch):
+    now = time.monotonic()
+    monkeypatch.setattr(time, "monotonic", lambda: now)
+    site = made()
+    site.apply(spec, {})
+    site._turn()
     running(site, ray, "gate")
     assert [each.trouble for each in site.status().streams.values()] == ["", ""]
     ray.of("gate").status = None  # its machine is cut off
     site._turn()
-    later = time.monotonic() + 50
-    monkeypatch.setattr(time, "monotonic", lambda: later)
+    now += 50
     site._turn()
     gate, roof = site.status().streams.values()
     assert (gate.state, gate.node, gate.trouble) == ("running", "n1", "it has not answered for 50 s")

@@ -7,9 +7,8 @@ import signal
 import socket
 import subprocess
 import sys
-import time
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from importlib import import_module
 
@@ -18,7 +17,7 @@ import pytest
 
 import catstream
 from catstream.client.registry import Registry
-from catstream.errors import StoreError
+from catstream.errors import ServiceError, StoreError
 from catstream.fleet import fleet as module
 from catstream.fleet.controller import nodes
 from catstream.fleet.fleet import _VARIABLES, Fleet
@@ -223,9 +222,14 @@ def test_a_subscriber_with_a_key_of_the_fleet_stays_attached_to_a_stream_that_mo
     allow(home / "site" / "keys", "desk", "watch", output=tmp_path / "desk")
     other = "south" if before.node == "north" else "north"
     address, keys = f"fleet://{spec.registry}/gate", str(tmp_path / "desk")
-    time.sleep(6.0)  # until the streams know the client
-    with catstream.subscribe(address, "tracks", timeout=150, keys=keys) as tracks:
-        first = next(tracks)
+    with ExitStack() as stack:
+
+        def attached():
+            with suppress(ServiceError):  # the stream does not know the client yet
+                subscription = stack.enter_context(catstream.subscribe(address, "tracks", timeout=150, keys=keys))
+                return subscription, next(subscription)
+
+        tracks, first = until(attached)
         fleet.add(replace(streams["gate"], labels={"ray.io/node-id": node_id(other)}))
         until(lambda: (found := fleet.status().streams["gate"]).node == other and found.state == "running")
         endpoint = tracks.endpoint

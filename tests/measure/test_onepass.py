@@ -120,4 +120,4 @@ def test_ctrl_c_while_the_workers_start_is_one_line_and_no_worker_is_left(walk, 
     assert errors.splitlines()[-1] == "stopped"
     assert "Traceback" not in errors
     assert process.returncode == 130
-    assert not psutil.wait_procs(children, timeout=10)[1]
+    assert not psutil.wait_procs(children, timeout=150)[1]

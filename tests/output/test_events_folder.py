@@ -11,7 +11,7 @@ import pytest
 from catstream.base.box import Box
 from catstream.client.address import Address
 from catstream.errors import VideoError
-from catstream.output import events_folder
+from catstream.output import events_folder, remote
 from catstream.output.destinations import Origin, SinkOptions, TrackedFrame, check_sink, open_sink
 from catstream.wire.channels import PREVIEWS
 from catstream.wire.messages import Preview, Track
@@ -27,6 +27,12 @@ def image(rng):
 
 def frame(number, box=BOX):
     return TrackedFrame([Track(number, number / 10, "absent" if box is None else "present", box, 0.9, 1, None, "anna")])
+
+
+@pytest.fixture(autouse=True)
+def _patient(monkeypatch):
+    """Wait for the picture of an event on a busy machine."""
+    monkeypatch.setattr(remote, "_PICTURE_SECONDS", 60.0)
 
 
 @contextmanager

@@ -73,6 +73,8 @@ def receiver():
 def _quick(monkeypatch):
     monkeypatch.setattr(webhook, "_PAUSE", 0.02)
     monkeypatch.setattr(webhook, "_LONGEST_PAUSE", 0.05)
+    monkeypatch.setattr(webhook, "CLOSE_SECONDS", 60.0)  # all is delivered on a busy machine
+    monkeypatch.setattr(remote, "_PICTURE_SECONDS", 60.0)
 
 
 @contextmanager

@@ -117,7 +117,7 @@ def test_paused_live_source_skips_frames(video, camera):
 
 @pytest.mark.parametrize("victims", [(), ("detector", "compressor", "trainer")], ids=str)
 def test_search_gives_the_tracks_of_one_process_if_processes_die(video, saved, victims):
-    path, settings = video[0], Settings(run={"lockstep": True})
+    path, settings = video[0], Settings(run={"lockstep": True, "unstored_frames": 4})
     tracks = []
     with (
         Pipeline(path, {"ben": PATCH}, settings) as pipeline,

@@ -61,7 +61,9 @@ def opened(pid):
 
 
 def has_ended(process):
-    return not process.is_running() or process.status() == psutil.STATUS_ZOMBIE
+    with suppress(psutil.NoSuchProcess):
+        return process.status() == psutil.STATUS_ZOMBIE
+    return True
 
 
 def test_process_is_forked_in_the_folder_of_its_program_without_files_of_the_server(start, tmp_path, monkeypatch):

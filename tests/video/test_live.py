@@ -75,9 +75,9 @@ def test_every_frame_is_returned_or_counted_as_skipped_and_the_last_is_the_newes
             skipped = source.skipped
             until(lambda: source.skipped >= skipped + 3)  # noqa: B023
         cam.sends.clear()
-        while taken[-1] < cam.sent - 1:
+        while taken[-1] < (sent := cam.sent) - 1:
             taken.append(number_of(next(source).image))
-        assert len(taken) + source.skipped == cam.sent
+        assert sent <= len(taken) + source.skipped <= cam.sent  # one more may be on its way
     assert taken == sorted(set(taken))
     assert len(taken) < cam.sent / 2
 
@@ -100,11 +100,11 @@ def test_a_camera_that_disconnects_is_reconnected_and_another_size_is_scaled(cam
         next(source)
         cam.leave()
         until(lambda: source.counters["lost_seconds"] > 0)
-        camera(lambda number: numbered(number, width=256), cam.port)
         before = source.reconnects
+        camera(lambda number: numbered(number, width=256), cam.port)
         frames = [next(source) for _ in range(3)]
-        until(lambda: source.reconnects == before + 1)
-        assert source.counters["lost_seconds"] == 0
+        until(lambda: source.reconnects > before)
+        until(lambda: source.counters["lost_seconds"] == 0)
     assert [frame.number for frame in frames] == [1, 2, 3]
     assert {frame.image.shape for frame in frames} == {(96, 128, 3)}, "the size of the first frame"
 
@@ -129,7 +129,7 @@ def test_a_camera_that_sends_no_frames_is_reconnected(camera, caplog, until):
         cam.sends.clear()
         until(lambda: source.counters["lost_seconds"] > 0.5)
         cam.sends.set()
-        until(lambda: source.reconnects == 1)
+        until(lambda: source.reconnects >= 1)
         next(source)
     assert "lost source one (no data: check the camera" in caplog.text
     assert "reconnected to source one after" in caplog.text
@@ -301,7 +301,7 @@ def test_hls_is_returned_at_the_pace_of_its_pictures_and_none_twice(tmp_path, se
             container.mux(stream.encode(av.VideoFrame.from_ndarray(numbered(number), format="bgr24")))
         container.mux(stream.encode(None))
     monkeypatch.setattr(live, "_LONGEST_SEGMENT", 0.2)
-    url, is_over = f"{served(tmp_path)}/live.m3u8", lambda: source.counters["lost_seconds"] > 2
+    url, is_over = f"{served(tmp_path)}/live.m3u8", lambda: source.counters.get("lost_seconds", 0) > 2
     with open_source(url, idle=is_over, read_timeout_seconds=0.3) as source:  # it reconnects after its last segment
         times = [frame.pts for frame in source]
     assert len(times) > 25, "a segment is not skipped"

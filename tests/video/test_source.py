@@ -68,6 +68,7 @@ def encoded(
             container.metadata["title"] = title
             stream: Any = container.add_stream(codec, rate=25, options=coding)
             stream.width, stream.height = 160, 120
+            stream.codec_context.thread_count = 3  # the bytes depend on it
             stream.pix_fmt = "yuvj420p" if codec == "mjpeg" else "yuv420p"
             tone: Any = container.add_stream("aac", rate=16000, layout="mono") if sound else None
             if rotation:

@@ -202,7 +202,7 @@ def test_a_client_that_cannot_connect_gets_an_error_that_says_what_to_check(plac
     with (
         Responder(CONTROL, place(server)) as detector,
         ThreadPoolExecutor(1) as pool,
-        catstream.control(address, timeout=1.0) as control,
+        catstream.control(address, timeout=1.0 if client == "wrong" else 60.0) as control,
     ):
         stopping = pool.submit(control.stop)
         until(stopping.done, lambda: detector.receive_all(0.02))
