@@ -148,6 +148,7 @@ def _with_file(name: str, suffix: str, help: str) -> Callable[[Callable[..., Any
 
 
 with_json_file = _with_file("json", ".json", "File for all figures.")
+with_raw_file = _with_file("raw", ".csv", "CSV file for the latency of each frame.")
 with_report_file = _with_file("report", ".html", "HTML file for a report.")
 
 

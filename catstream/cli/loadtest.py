@@ -21,6 +21,7 @@ from catstream.cli.common import (
     table,
     text,
     with_json_file,
+    with_raw_file,
     with_report_file,
     write_json,
 )
@@ -90,12 +91,14 @@ def _usage_errors(*kinds: type[CatstreamError]) -> Iterator[None]:
 @click.option("--find-streams", is_flag=True, help="Search for the highest number of streams that meets the limits.")
 @click.option("--limit", "limits", multiple=True, metavar="NAME=VALUE", help="Limit to meet, see above; repeatable.")
 @with_json_file
+@with_raw_file
 @with_report_file
 @with_settings
 def loadtest(
     find_streams: bool,
     limits: tuple[str, ...],
     json_file: Path | None,
+    raw_file: Path | None,
     report_file: Path | None,
     **plan: Any,
 ) -> None:
@@ -129,7 +132,7 @@ def loadtest(
       catstream loadtest --subscribers 500 --limit subscriber-p99=0.05 --report load.html
       catstream loadtest --find-streams --rate 25 --size 1920x1080
     """
-    from catstream.measure.load_report import milliseconds, to_json, verdict, write_report
+    from catstream.measure.load_report import milliseconds, to_json, verdict, write_raw, write_report
     from catstream.measure.load_result import Limit, Plan, violations
     from catstream.measure.load_test import run_load_test
 
@@ -158,6 +161,8 @@ def loadtest(
     if load_test.results:
         _print_run(load_test.result, parsed)
         write_json(json_file, to_json(load_test))
+        if raw_file is not None:
+            write_raw(raw_file, load_test.result)
         if report_file is not None:
             click.echo(f"report: {write_report(report_file, load_test)}")
         click.echo(verdict(load_test))

@@ -12,6 +12,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from threading import Event, Thread
 from time import monotonic
+from typing import NamedTuple
 
 import numpy as np
 import psutil
@@ -32,6 +33,7 @@ PERCENTILES = {"p50": 50.0, "p95": 95.0, "p99": 99.0, "p99.9": 99.9, "max": 100.
 REST = "everything else"
 
 _POLL_SECONDS = 0.1
+_MEMORY_SECONDS = 5.0  # between two readings of memory
 _SUCCESS = 0.5  # a frame with a larger IoU is a success
 
 
@@ -226,24 +228,45 @@ def latencies(due: Float64, first: Float64, end: float) -> Float64:
     return np.asarray(np.minimum(first, end) - due)
 
 
-class Usage:
-    """Processor use of named groups of processes; after a restart, the process ids of a group may change.
+class Reading(NamedTuple):
+    """The use of the processor and of memory by named groups of processes.
 
-    readings  mean number of busy cores since the reading before, by name, and of `REST`, oldest first
+    moment   time by `time.monotonic`
+    seconds  since the reading before
+    cores    mean number of busy cores since then by name, and of `REST`
+    memory   bytes (PSS) by name; empty if they were not read
+    """
+
+    moment: float
+    seconds: float
+    cores: dict[str, float]
+    memory: dict[str, int]
+
+
+class Usage:
+    """Readings of named groups of processes, oldest first; after a restart, the process ids of a group may change.
+
+    Memory is read every five seconds, because the kernel takes milliseconds for each process.
     """
 
     def __init__(self) -> None:
-        self.readings: dict[str, list[float]] = {}
+        self.readings: list[Reading] = []
         self._processes: dict[int, psutil.Process] = {}  # psutil keeps the processor time of the previous reading in it
+        self._moment = self._memory_at = 0.0
 
-    def read(self, groups: Mapping[str, Iterable[int]]) -> None:
+    def read(self, groups: Mapping[str, Iterable[int]], *, is_last: bool = False) -> None:
         """Add a reading of groups of process ids; the first call only starts the measurement."""
-        is_first = not self._processes
+        is_first, before, self._moment = not self._processes, self._moment, monotonic()
         all_cores = psutil.cpu_percent() / 100 * (psutil.cpu_count() or 1)
         cores = {name: sum(map(self._cores, pids)) for name, pids in groups.items()}
-        if not is_first:
-            for name, reading in (cores | {REST: max(0.0, all_cores - sum(cores.values()))}).items():
-                self.readings.setdefault(name, []).append(reading)
+        if is_first:
+            return
+        memory: dict[str, int] = {}
+        if is_last or self._moment >= self._memory_at:
+            memory = {name: proportional_memory(pids) for name, pids in groups.items()}
+            self._memory_at = self._moment + _MEMORY_SECONDS
+        cores[REST] = max(0.0, all_cores - sum(cores.values()))
+        self.readings.append(Reading(self._moment, self._moment - before, cores, memory))
 
     def _cores(self, pid: int) -> float:
         """Return the busy cores of a process; 0 if it has just ended."""

@@ -6,14 +6,16 @@ from collections.abc import Iterator
 from dataclasses import fields
 from importlib.metadata import version
 from pathlib import Path
-from statistics import fmean
 from typing import NamedTuple
 
+import numpy as np
+
 from catstream.base.arrays import Float64
+from catstream.base.tables import write_table
 from catstream.measure.latency import PERCENTILES, percentiles
 from catstream.measure.load_result import Result, violations
 from catstream.measure.load_test import MOST_STREAMS, LoadTest
-from catstream.output.report import write_page
+from catstream.output.report import COLOURS, round_up, write_page
 
 
 class Table(NamedTuple):
@@ -56,11 +58,8 @@ def tables(result: Result) -> Iterator[Table]:
         "messages that were not in the coreset trees at the end. Success: share of frames with an IoU with the ground "
         "truth above 0.5; a skipped frame has the box of the last tracked frame.",
     )
-    if result.usage:
-        processes = [
-            {"process": name, **_cost(fmean(readings), result.memory.get(name))}
-            for name, readings in result.usage.items()
-        ]
+    if result.readings:
+        processes = [{"process": name, **_cost(cores, result.memory.get(name))} for name, cores in result.cores.items()]
         yield Table("Processes", processes, "MB: as above (PSS), at the end of the run.")
     if result.subscribers:
         subscribers = [
@@ -82,6 +81,56 @@ def tables(result: Result) -> Iterator[Table]:
             "Milliseconds from the due time of a frame to its receipt by a fast subscriber, and the p99 of the slowest "
             "one. Missed: frames whose messages were lost, of all subscribers together, and at most of one.",
         )
+
+
+class Panel(NamedTuple):
+    """A part of the chart over time: its title, the value at its upper end, and curves by name, in 1000 x 100 units."""
+
+    title: str
+    top: float
+    curves: dict[str, str]
+
+
+def panels(timeline: dict[str, list[float]], due: float) -> Iterator[Panel]:
+    """Yield the parts of the chart, which share the axis of time; `due` is the number of frames per second."""
+    figures = {name: np.array(values) for name, values in timeline.items()}
+    x = 1000 * (np.arange(len(figures["seconds"])) + 0.5) / len(figures["seconds"])  # the middle of each interval
+    latencies = {name.replace("-", ", "): 1000 * figures[name] for name in figures if name.endswith(("p50", "p99"))}
+    cores = {"pipelines": "cores", "rest of the load test": "load_cores", "other processes": "other_cores"}
+    for title, curves in (
+        ("Latency, ms", latencies),
+        ("Frames/s", {"tracked": figures["frames_per_second"], "skipped": due * figures["skipped"]}),
+        ("Busy cores", {name: figures[key] for name, key in cores.items()}),
+        ("Memory (PSS), MB", {"pipelines": figures["memory"] / 1e6}),
+    ):
+        top = round_up(max(0.1, *(float(values.max()) for values in curves.values())))
+        lines = {name: zip(x, 100 - 100 * values / top, strict=True) for name, values in curves.items()}
+        yield Panel(title, top, {name: " ".join(f"{x:.1f},{y:.1f}" for x, y in line) for name, line in lines.items()})
+
+
+def write_raw(path: Path, result: Result) -> None:
+    """Write a CSV file with a row for each frame and each receiver: the load test itself, or a fast subscriber."""
+
+    def rows() -> Iterator[tuple[object, ...]]:
+        for number, stream in enumerate(result.streams):
+            receipts = [each for each in result.subscribers if each.stream == number]
+            own = [("tracks", "", stream.track), ("models", "", stream.model)]
+            extra = [(each.channel, str(index), row) for each in receipts for index, row in enumerate(each.latency)]
+            for channel, subscriber, latency in (*own, *extra):
+                for frame, seconds in enumerate(latency):
+                    moment = stream.due[frame] - result.streams[0].due[0]
+                    yield (
+                        number,
+                        channel,
+                        subscriber,
+                        frame,
+                        f"{moment:.6f}",
+                        int(stream.tracked[frame]),
+                        f"{seconds:.6f}",
+                    )
+
+    heads = ("stream", "channel", "subscriber", "frame", "due_seconds", "tracked", "latency_seconds")
+    write_table(path, heads, rows())
 
 
 def milliseconds(seconds: float | None) -> str:
@@ -127,9 +176,9 @@ def to_json(load_test: LoadTest) -> dict[str, object]:
             for number, stream in enumerate(result.streams)
         ],
         "processes": {
-            name: {"cores": fmean(readings), "memory": result.memory.get(name)}
-            for name, readings in result.usage.items()
+            name: {"cores": cores, "memory": result.memory.get(name)} for name, cores in result.cores.items()
         },
+        "timeline": result.timeline,
         "subscribers": [
             {
                 **{name: getattr(receipts, name) for name in ("stream", "channel", "received", "missed")},
@@ -158,7 +207,8 @@ def to_json(load_test: LoadTest) -> dict[str, object]:
 
 def write_report(path: Path, load_test: LoadTest) -> Path:
     """Write the report of the decisive run, and of the steps of a search."""
-    result = load_test.result
+    result, timeline = load_test.result, load_test.result.timeline
+    has_chart = bool(result.readings) and len(timeline["seconds"]) > 1
     verdicts = [(verdict(load_test), load_test.sustained is not False)]
     verdicts += [(error, False) for error in result.errors]
     verdicts += [(limit.describe(result), limit.is_met(result)) for limit in load_test.limits]
@@ -172,6 +222,9 @@ def write_report(path: Path, load_test: LoadTest) -> Path:
             f"{milliseconds(result.camera_late)} ms late, and other processes of this machine kept "
             f"{result.other_load:.2f} cores busy."
         ),
+        panels=[*panels(timeline, result.plan.rate * len(result.streams))] if has_chart else [],
+        seconds=sum(timeline["seconds"][-1:] + timeline["seconds"][1:2]),  # the end of the last interval
+        colours=COLOURS,
         tables=[*([_steps(load_test)] if load_test.find else []), *tables(result)],
         settings=result.plan.settings,
     )

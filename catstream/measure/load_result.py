@@ -13,7 +13,8 @@ from catstream.base.names import check_count
 from catstream.base.settings import Settings
 from catstream.base.text import counted
 from catstream.errors import SettingsError
-from catstream.measure.latency import PERCENTILES, REST, Measures, Receipts
+from catstream.measure.latency import PERCENTILES, REST, Measures, Reading, Receipts
+from catstream.measure.timeline import timeline
 from catstream.video import rendered
 
 #: The figures that can have a limit, by name. If there are several streams, the worst one counts.
@@ -97,10 +98,9 @@ class Result:
     plan         parameters of the run
     seconds      duration of the measured frames: less than planned if the run was interrupted
     streams      measures of each stream
-    usage        readings of the busy cores of each process, and of the processes outside the load test
+    readings     use of the processor and of memory by each process, and of the processor by other ones
     subscribers  measures of the fast subscribers to each channel of each stream
     camera_late  largest delay in seconds of a frame that the camera itself caused
-    memory       bytes of each process, in which a shared page counts in proportion (PSS)
     errors       errors of failed streams
     interrupted  whether the run was interrupted
     """
@@ -108,10 +108,9 @@ class Result:
     plan: Plan
     seconds: float
     streams: list[Measures]
-    usage: dict[str, list[float]]
+    readings: list[Reading]
     subscribers: list[Receipts]
     camera_late: float
-    memory: dict[str, int] = field(default_factory=dict)
     errors: list[str] = field(default_factory=list)
     interrupted: bool = False
 
@@ -123,6 +122,11 @@ class Result:
             for name, value in figures.items():
                 worst[name] = (min if name == "success" else max)(worst[name], value)
         return worst
+
+    @property
+    def timeline(self) -> dict[str, list[float]]:
+        """The figures over time, see `catstream.measure.timeline`."""
+        return timeline(self.plan.rate, self.streams, self.subscribers, self.readings)
 
     @property
     def track(self) -> Float64:
@@ -137,10 +141,22 @@ class Result:
         """Return the tracked frames per second if this share was skipped."""
         return self.plan.rate * (1 - skipped)
 
+    @property
+    def cores(self) -> dict[str, float]:
+        """Mean number of busy cores by the name of the process, and of `REST`."""
+        names = dict.fromkeys(name for reading in self.readings for name in reading.cores)
+        weights = [reading.seconds for reading in self.readings]
+        return {name: fmean([each.cores.get(name, 0.0) for each in self.readings], weights) for name in names}
+
+    @property
+    def memory(self) -> dict[str, int]:
+        """Bytes of each process at the end, in which a shared page counts in proportion (PSS)."""
+        return self.readings[-1].memory if self.readings else {}
+
     def cost(self, number: int) -> tuple[float, int]:
         """Return the processor seconds per second, and the bytes of memory, of the processes of a stream."""
         of_stream = f" {number}"
-        cores = sum(fmean(readings) for name, readings in self.usage.items() if name.endswith(of_stream))
+        cores = sum(cores for name, cores in self.cores.items() if name.endswith(of_stream))
         return cores, sum(size for name, size in self.memory.items() if name.endswith(of_stream))
 
     @property
@@ -151,7 +167,7 @@ class Result:
     @property
     def other_load(self) -> float:
         """Mean number of cores that were busy with processes outside the load test."""
-        return fmean(self.usage[REST]) if REST in self.usage else 0.0
+        return self.cores.get(REST, 0.0)
 
 
 @dataclass(frozen=True, slots=True)

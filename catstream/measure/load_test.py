@@ -11,7 +11,7 @@ from time import monotonic
 
 from catstream.errors import ServiceError, errors_in
 from catstream.measure.camera import Camera, Schedule
-from catstream.measure.latency import Observations, Usage, measure, observed, proportional_memory
+from catstream.measure.latency import Observations, Usage, measure, observed
 from catstream.measure.load import Stream, Video, render
 from catstream.measure.load_result import Limit, Plan, Report, Result, violations
 from catstream.measure.subscribers import Subscribers
@@ -20,13 +20,13 @@ MOST_STREAMS = 64  # of a load test
 _START_TIMEOUT_SECONDS = 120.0  # for each phase of the start
 _LEAD_SECONDS = 0.5  # from the end of the start to the first frame, and half a frame: a still is no nearer to it
 _GRACE_SECONDS = 3.0  # to wait for the track of the last frame
-_READING_SECONDS = 0.5  # between two readings of processor and memory use
+_READING_SECONDS = 1.0  # between two readings of processor and memory use
 _LOOP_SECONDS = 0.05
 
 
 def run(plan: Plan, video: Video, report: Report) -> Result:
     """Run a camera and pipelines on its streams, and measure; after Ctrl-C, return the measurements so far."""
-    usage, interrupted, next_reading = Usage(), False, 0.0
+    usage, interrupted = Usage(), False
     with ExitStack() as stack:
         camera = stack.enter_context(Camera(plan.source, plan.size, video.units, video.still, plan.streams))
         streams = [Stream(number, url, video.boxes, plan.settings) for number, url in enumerate(camera.urls)]
@@ -41,10 +41,12 @@ def run(plan: Plan, video: Video, report: Report) -> Result:
         for group in groups:
             group.begin(observations)
         schedules = camera.play(Schedule(monotonic() + _LEAD_SECONDS + 0.5 / plan.rate, plan.rate))
+        usage.read(processes())
+        next_reading = schedules[0].start + _READING_SECONDS
         try:
             for now in _until_the_last_track(plan, streams, observations, schedules):
                 if now >= next_reading:
-                    next_reading = now + _READING_SECONDS
+                    next_reading += _READING_SECONDS
                     usage.read(processes())
                 passed = (now - schedules[0].start) / plan.duration
                 tracks = f"{sum(len(stream.tracks) for stream in observations)} tracks"
@@ -52,7 +54,7 @@ def run(plan: Plan, video: Video, report: Report) -> Result:
         except KeyboardInterrupt:
             interrupted = True
         end, late = monotonic(), camera.late
-        memory = {name: proportional_memory(pids) for name, pids in processes().items()}
+        usage.read(processes(), is_last=True)
         report("ending", 1.0, "")
         _stop(streams)
         for group in groups:
@@ -67,10 +69,9 @@ def run(plan: Plan, video: Video, report: Report) -> Result:
             measure(observation, schedule, number, video.truth, end, stream.totals)
             for observation, schedule, number, stream in zip(observations, schedules, due, streams, strict=True)
         ],
-        usage=usage.readings,
+        readings=usage.readings,
         subscribers=[group.receipts(observations, schedules, due, end) for group in groups],
         camera_late=late,
-        memory=memory,
         errors=[f"stream {stream.number}: {stream.error}" for stream in streams if stream.error],
         interrupted=interrupted,
     )

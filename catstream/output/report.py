@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import math
 from functools import cache
 from pathlib import Path
 
@@ -34,6 +35,16 @@ def _environment() -> Environment:
     environment.filters["clock"] = clock
     environment.filters["base64"] = lambda data: base64.b64encode(data).decode("ascii")
     return environment
+
+
+def round_up(value: float) -> float:
+    """Return a round number that is not smaller, for the upper end of an axis.
+
+    >>> round_up(0.31), round_up(731.0)
+    (0.35, 750.0)
+    """
+    step = 10.0 ** math.floor(math.log10(value)) / 2
+    return step * math.ceil(value / step)
 
 
 def clock(seconds: float) -> str:

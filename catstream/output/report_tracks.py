@@ -19,7 +19,7 @@ from catstream.base.tables import write_table
 from catstream.base.text import counted
 from catstream.errors import VideoError
 from catstream.output.destinations import Header
-from catstream.output.report import clock, write_page
+from catstream.output.report import clock, round_up, write_page
 from catstream.output.track_log import Log
 from catstream.video.drawing import Colours, draw
 from catstream.video.frames import RATE, jpeg
@@ -192,8 +192,7 @@ class Section:
         duration = self.end - self.start
         speeds = {name: item.speeds(max(_SPEED_SECONDS, duration / _BINS)) for name, item in self._objects.items()}
         fastest = max(self._scale.size, *(np.fmax.reduce(values, initial=0) for _, values in speeds.values()))
-        step = 10 ** np.floor(np.log10(fastest)) / 2
-        top = step * np.ceil(fastest / step)  # a round number
+        top = round_up(fastest)
         lines = {}
         for name, (middles, values) in speeds.items():
             points = np.column_stack([1000 * (middles - self.start) / duration, 460 - 440 * values / top])
@@ -201,7 +200,7 @@ class Section:
             parts = np.split(points, np.flatnonzero(np.diff(np.isnan(points[:, 1]))) + 1)
             curves = (part for part in parts if len(part) and not np.isnan(part[0, 1]))
             lines[name] = [" ".join(f"{x:.1f},{y:.1f}" for x, y in curve) for curve in curves]
-        return lines, float(top)
+        return lines, top
 
 
 def _texts(row: Sequence[float], scale: Scale) -> list[str]:

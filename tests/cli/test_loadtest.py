@@ -10,7 +10,7 @@ def test_run_counts_every_frame_and_prints_the_violated_limit(said, tmp_path):
     arguments = ["--rate", 20, "--duration", 3, "--size", "320x240", "--subscribers", 3, "--slow-subscribers", 2]
     limits = ["--limit", "max=0", "--limit", "subscriber-missed=1"]
     code, output, errors = said(
-        "loadtest", *arguments, *limits, "--report", "load.html", "--json", "x.json", cwd=tmp_path
+        "loadtest", *arguments, *limits, "--report", "load.html", "--json", "x.json", "--raw", "x.csv", cwd=tmp_path
     )
     assert code == 1
     assert errors == ""
@@ -34,6 +34,10 @@ def test_run_counts_every_frame_and_prints_the_violated_limit(said, tmp_path):
     assert len(receipts["received"]) == 1
     assert {"detector 0", "compressor 0", "trainer 0", "camera", "subscribers"} <= set(figures["processes"])
     assert figures["processes"]["detector 0"]["cores"] > 0
+
+    assert figures["timeline"]["seconds"] == [0, 1, 2]
+    assert min(figures["timeline"]["cores"]) > 0
+    assert len((tmp_path / "x.csv").read_text().splitlines()) == 1 + 60 * (2 + 1)  # tracks, models, one fast subscriber
 
     page = (tmp_path / "load.html").read_text()
     assert "<h2>Streams</h2>" in page

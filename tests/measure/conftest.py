@@ -44,7 +44,7 @@ def result() -> Callable[..., Result]:
             frames = np.arange(len(seconds))
             seen = {"due": 100 + frames / 10, "tracked": frames < tracked * len(seconds)}
             measures.append(Measures(**seen, track=seconds, model=seconds, success=success))
-        facts = {"usage": {}, "subscribers": [], "camera_late": 0.001}
+        facts = {"readings": [], "subscribers": [], "camera_late": 0.001}
         return Result(Plan(streams=len(streams)), 10.0, measures, **{**facts, **others})
 
     return made

@@ -2,7 +2,10 @@
 
 import json
 
-from catstream.measure.load_report import to_json, verdict, write_report
+import numpy as np
+
+from catstream.measure.latency import REST, Reading, Receipts
+from catstream.measure.load_report import to_json, verdict, write_raw, write_report
 from catstream.measure.load_result import Limit
 from catstream.measure.load_test import LoadTest
 
@@ -39,14 +42,36 @@ def test_interrupted_search_says_at_least(result):
 
 
 def test_every_stream_and_process_has_its_row(result, tmp_path):
-    usage, memory = {"detector 0": [0.5], "detector 1": [0.7]}, {"detector 0": 10**8, "detector 1": 2 * 10**8}
-    run = result([0.01] * 50, [0.02] * 50, usage=usage, memory=memory, errors=["stream 1: <it> died"])
+    cores, memory = {"detector 0": 0.5, "detector 1": 0.7, REST: 0.1}, {"detector 0": 10**8, "detector 1": 2 * 10**8}
+    run = result(
+        [0.01] * 50, [0.02] * 50, readings=[Reading(105.0, 1.0, cores, memory)], errors=["stream 1: <it> died"]
+    )
     assert [run.cost(number)[1] for number in (0, 1)] == [10**8, 2 * 10**8]
     page = write_report(tmp_path / "report.html", LoadTest([], results=[run])).read_text()
     for row in ("detector 0", "detector 1"):
         assert f'<td class="text">{row}</td>' in page
     assert "stream 1: &lt;it&gt; died" in page
     assert '<tr class="mean"><td class="text">all</td>' in page
+
+
+def test_chart_has_a_point_for_each_second(result, tmp_path):
+    cores, memory = {"detector 0": 0.5, "camera": 0.1, REST: 0.2}, {"detector 0": 10**8}
+    receipts = Receipts(0, "tracks", np.full((2, 50), 0.2), [50, 50], [0, 0])
+    run = result([0.1] * 50, readings=[Reading(105.0, 5.0, cores, memory)], subscribers=[receipts])
+    page = write_report(tmp_path / "report.html", LoadTest([], results=[run])).read_text()
+    assert page.count("<polyline") == 4 + 2 + 3 + 1  # latencies here and of the subscribers, frames, cores, memory
+    assert page.count('"100.0,50.0 300.0,50.0 500.0,50.0 700.0,50.0 900.0,50.0"') == 2  # 100 ms of 200
+    assert ">5 s</text>" in page
+
+
+def test_raw_file_has_a_row_for_each_frame_and_receiver(result, tmp_path):
+    receipts = Receipts(1, "tracks", np.array([[0.5, 0.25]]), [2], [0])
+    write_raw(tmp_path / "raw.csv", result([0.1] * 2, [0.2] * 2, tracked=0.5, subscribers=[receipts]))
+    head, *rows = (tmp_path / "raw.csv").read_text().splitlines()
+    assert head == "stream,channel,subscriber,frame,due_seconds,tracked,latency_seconds"
+    assert rows[:2] == ["0,tracks,,0,0.000000,1,0.100000", "0,tracks,,1,0.100000,0,0.100000"]
+    assert rows[-1] == "1,tracks,0,1,0.100000,0,0.250000"
+    assert len(rows) == 2 * 2 * 2 + 2
 
 
 def test_json_report_contains_only_valid_json(result):

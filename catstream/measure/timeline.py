@@ -1,0 +1,74 @@
+"""The figures of a load test over time."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+
+import numpy as np
+
+from catstream.measure.latency import REST, Measures, Reading, Receipts, percentiles
+
+_MOST_INTERVALS = 3600
+_ROUNDING = 1e-6  # seconds by which a frame may be due before the interval that it belongs to
+
+
+def timeline(
+    rate: float, streams: Sequence[Measures], subscribers: Sequence[Receipts], readings: Sequence[Reading]
+) -> dict[str, list[float]]:
+    """Return the figures of each second, of all streams together.
+
+    The intervals are longer in a run of more than an hour, or below one frame per second, so that each has a frame.
+
+    seconds            begin of each interval, from the due time of the first frame on
+    p50, p95, p99      seconds from the frames that are due in the interval to their tracks
+    tracks-p50 ...     seconds to their receipt by fast subscribers, for each channel
+    skipped            share of the frames
+    frames_per_second  tracked frames
+    cores              mean number of busy cores, by the pipelines
+    load_cores         ... by the camera, the subscribers and the load test
+    other_cores        ... by other processes of the machine
+    memory             bytes of the pipelines (PSS), which is read every five seconds
+    """
+    start = min(stream.due[0] for stream in streams)
+    duration = max(stream.due[-1] for stream in streams) - start
+    interval = max(int(duration) // _MOST_INTERVALS + 1, math.ceil(1 / rate))
+    seconds = np.arange(0, duration + _ROUNDING, interval)
+
+    def by_interval(measured: Iterable[tuple[np.ndarray, np.ndarray]]) -> list[np.ndarray]:
+        """All values of each interval, from arrays of due times and of values, with the frames along the last axis."""
+        ends = start + seconds[1:] - _ROUNDING
+        parts = [np.split(values, np.searchsorted(due, ends), axis=-1) for due, values in measured]
+        return [np.concatenate([part.ravel() for part in of_streams]) for of_streams in zip(*parts, strict=True)]
+
+    # Step 1: latencies, at the load test and at its subscribers; and frames.
+    latencies = {"": [(stream.due, stream.track) for stream in streams]}
+    for each in subscribers:
+        if each.received:
+            latencies.setdefault(f"{each.channel}-", []).append((streams[each.stream].due, each.latency))
+    figures: dict[str, list[float]] = {"seconds": seconds.tolist()}
+    for prefix, measured in latencies.items():
+        rows = [percentiles(values) for values in by_interval(measured)]
+        figures |= {prefix + name: [row[name] for row in rows] for name in ("p50", "p95", "p99")}
+    tracked = by_interval((stream.due, stream.tracked) for stream in streams)
+    figures["skipped"] = [1 - float(flags.mean()) for flags in tracked]
+    figures["frames_per_second"] = [rate * len(streams) * (1 - share) for share in figures["skipped"]]
+
+    # Step 2: processor and memory at the end of each interval, interpolated between the readings.
+    points = {
+        "cores": [(reading.moment, _of_pipelines(reading.cores)) for reading in readings],
+        "load_cores": [
+            (reading.moment, sum(reading.cores.values()) - reading.cores[REST] - _of_pipelines(reading.cores))
+            for reading in readings
+        ],
+        "other_cores": [(reading.moment, reading.cores[REST]) for reading in readings],
+        "memory": [(reading.moment, _of_pipelines(reading.memory)) for reading in readings if reading.memory],
+    }
+    for name, values in points.items() if readings else ():
+        figures[name] = np.interp(start + seconds + interval, *np.transpose(values)).tolist()
+    return figures
+
+
+def _of_pipelines(amounts: Mapping[str, float]) -> float:
+    """The sum of the processes of all pipelines, whose names end with the number of the stream."""
+    return sum(amount for name, amount in amounts.items() if name[-1].isdigit())
