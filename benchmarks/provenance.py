@@ -7,8 +7,6 @@ As a script, it runs a command of catstream that has the option `--json`, and wr
 from __future__ import annotations
 
 import json
-import os
-import platform
 import shlex
 import shutil
 import subprocess
@@ -22,7 +20,7 @@ from pathlib import Path
 import cv2
 from threadpoolctl import threadpool_info
 
-from catstream.base.threads import cores
+import catstream.measure.provenance
 
 ROOT = Path(__file__).parents[1]
 _LIBRARIES = ("numpy", "scipy", "numba", "scikit-learn", "pyzmq")
@@ -45,31 +43,18 @@ def provenance(settings: Sequence[str], words: Sequence[str]) -> dict[str, objec
 
 
 def machine() -> dict[str, object]:
-    """Return the processor, the cores available to this process, the memory in GB, and versions of the libraries."""
+    """Return the machine as in a load test, and versions of the libraries."""
     blas = {
         f"{pool['internal_api']} {pool['version']} {pool.get('architecture', '')}".strip()
         for pool in threadpool_info()
         if pool["user_api"] == "blas"
     }
     return {
-        "processor": _processor(),
-        "cores": cores(),
-        "memory_gb": round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9),
-        "system": platform.system(),
-        "python": platform.python_version(),
+        **catstream.measure.provenance.machine(),
         "opencv": cv2.__version__,
         "blas": sorted(blas),
         **{library: version(library) for library in _LIBRARIES},
     }
-
-
-def _processor() -> str:
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-    except OSError:
-        lines = []
-    names = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
-    return next(names, platform.machine())
 
 
 def _commit() -> str | None:

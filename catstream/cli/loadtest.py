@@ -135,6 +135,7 @@ def loadtest(
     from catstream.measure.load_report import milliseconds, to_json, verdict, write_raw, write_report
     from catstream.measure.load_result import Limit, Plan, violations
     from catstream.measure.load_test import run_load_test
+    from catstream.measure.provenance import provenance
 
     parameters = Plan(**plan)
     parsed = [*map(Limit.parse, limits)] or Limit.defaults(parameters)
@@ -159,12 +160,13 @@ def loadtest(
     for streams, reason in load_test.refused.items():
         click.echo(f"{streams} streams did not start: {reason}")
     if load_test.results:
+        made = provenance(["catstream", *sys.argv[1:]])
         _print_run(load_test.result, parsed)
-        write_json(json_file, to_json(load_test))
+        write_json(json_file, to_json(load_test, made))
         if raw_file is not None:
             write_raw(raw_file, load_test.result)
         if report_file is not None:
-            click.echo(f"report: {write_report(report_file, load_test)}")
+            click.echo(f"report: {write_report(report_file, load_test, made)}")
         click.echo(verdict(load_test))
     if load_test.interrupted:
         stopped("these are the results so far" if load_test.results else "there are no measurements yet")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import fields
-from importlib.metadata import version
 from pathlib import Path
 from typing import NamedTuple
 
@@ -95,7 +94,11 @@ def panels(timeline: dict[str, list[float]], due: float) -> Iterator[Panel]:
     """Yield the parts of the chart, which share the axis of time; `due` is the number of frames per second."""
     figures = {name: np.array(values) for name, values in timeline.items()}
     x = 1000 * (np.arange(len(figures["seconds"])) + 0.5) / len(figures["seconds"])  # the middle of each interval
-    latencies = {name.replace("-", ", "): 1000 * figures[name] for name in figures if name.endswith(("p50", "p99"))}
+    latencies = {
+        name.replace("-", " at subscribers, "): 1000 * values
+        for name, values in figures.items()
+        if name.endswith(("p50", "p99"))
+    }
     cores = {"pipelines": "cores", "rest of the load test": "load_cores", "other processes": "other_cores"}
     for title, curves in (
         ("Latency, ms", latencies),
@@ -148,15 +151,15 @@ def _cost(cores: float, memory: float | None) -> dict[str, str]:
     return {"cores": f"{cores:.2f}", "MB": "-" if memory is None else f"{memory / 1e6:.0f}"}
 
 
-def to_json(load_test: LoadTest) -> dict[str, object]:
-    """Return the figures of the decisive run and of the search steps, the version and the settings.
+def to_json(load_test: LoadTest, provenance: dict[str, object]) -> dict[str, object]:
+    """Return the provenance, the settings, and the figures of the decisive run and of the search steps.
 
     Units are seconds, bytes, and shares from 0 to 1.
     """
     result = load_test.result
     plan = {item.name: getattr(result.plan, item.name) for item in fields(result.plan) if item.name != "settings"}
     return {
-        "version": version("catstream"),
+        **provenance,
         "settings": result.plan.settings.changed(),
         "plan": plan,
         "seconds": result.seconds,
@@ -205,7 +208,7 @@ def to_json(load_test: LoadTest) -> dict[str, object]:
     }
 
 
-def write_report(path: Path, load_test: LoadTest) -> Path:
+def write_report(path: Path, load_test: LoadTest, provenance: dict[str, object]) -> Path:
     """Write the report of the decisive run, and of the steps of a search."""
     result, timeline = load_test.result, load_test.result.timeline
     has_chart = bool(result.readings) and len(timeline["seconds"]) > 1
@@ -215,6 +218,7 @@ def write_report(path: Path, load_test: LoadTest) -> Path:
     return write_page(
         path,
         "loadtest.html",
+        provenance=provenance,
         verdicts=verdicts,
         about=(
             f"{result.plan}, {result.seconds:.1f} s{', interrupted' * load_test.interrupted}. Latency counts from the "

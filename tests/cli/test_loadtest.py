@@ -22,6 +22,7 @@ def test_run_counts_every_frame_and_prints_the_violated_limit(said, tmp_path):
 
     figures = json.loads((tmp_path / "x.json").read_text())
     assert (figures["sustained"], figures["verdict"]) == (False, output.splitlines()[-1])
+    assert figures["command"].startswith("catstream loadtest --rate 20")
     (stream,) = figures["streams"]
     assert stream["frames"] == 60
     assert stream["frames_per_second"] == pytest.approx(20 * (1 - stream["skipped"]))

@@ -8,19 +8,22 @@ from catstream.measure.latency import REST, Reading, Receipts
 from catstream.measure.load_report import to_json, verdict, write_raw, write_report
 from catstream.measure.load_result import Limit
 from catstream.measure.load_test import LoadTest
+from catstream.measure.provenance import provenance
+
+PROVENANCE = provenance(["catstream", "loadtest", "--limit", "p99=0.1", "rtsp://me:secret@camera/1"])
 
 
 def test_a_search_shows_the_number_of_streams_and_the_steps(result, tmp_path):
     runs = [result(*[[seconds] * 50] * streams) for streams, seconds in ((1, 0.01), (4, 0.3), (2, 0.02))]
     load_test = LoadTest([Limit("p99", 0.1)], find=True, results=runs, highest=2)
     assert (load_test.result.plan.streams, load_test.sustained) == (2, True)
-    page = write_report(tmp_path / "report.html", load_test).read_text()
+    page = write_report(tmp_path / "report.html", load_test, PROVENANCE).read_text()
     assert "Sustained: at most 2 streams" in page
     assert (page.count(">met<"), page.count(">exceeded<")) == (2, 1)
-    steps = to_json(load_test)["steps"]
+    steps = to_json(load_test, {})["steps"]
     assert [(step["streams"], step["p99"]) for step in steps] == [(1, 0.01), (4, 0.3), (2, 0.02)]
     load_test = LoadTest([Limit("p99", 0.1)], find=True, results=runs[1:2])
-    assert "Not sustained: 4 streams" in write_report(tmp_path / "report.html", load_test).read_text()
+    assert "Not sustained: 4 streams" in write_report(tmp_path / "report.html", load_test, PROVENANCE).read_text()
 
 
 def test_verdict_is_the_first_line_of_the_report_and_in_json(result, tmp_path):
@@ -28,8 +31,8 @@ def test_verdict_is_the_first_line_of_the_report_and_in_json(result, tmp_path):
         run = result([0.01] * 50, [0.01] * 50, tracked=tracked)
         load_test = LoadTest(Limit.defaults(run.plan), results=[run])
         assert verdict(load_test).startswith(told)
-        assert to_json(load_test)["sustained"] == (tracked == 1)
-        page = write_report(tmp_path / "report.html", load_test).read_text()
+        assert to_json(load_test, {})["sustained"] == (tracked == 1)
+        page = write_report(tmp_path / "report.html", load_test, PROVENANCE).read_text()
         assert page.index(verdict(load_test)) < page.index("<h2>Streams</h2>")
 
 
@@ -47,18 +50,24 @@ def test_every_stream_and_process_has_its_row(result, tmp_path):
         [0.01] * 50, [0.02] * 50, readings=[Reading(105.0, 1.0, cores, memory)], errors=["stream 1: <it> died"]
     )
     assert [run.cost(number)[1] for number in (0, 1)] == [10**8, 2 * 10**8]
-    page = write_report(tmp_path / "report.html", LoadTest([], results=[run])).read_text()
+    page = write_report(tmp_path / "report.html", LoadTest([], results=[run]), PROVENANCE).read_text()
     for row in ("detector 0", "detector 1"):
         assert f'<td class="text">{row}</td>' in page
     assert "stream 1: &lt;it&gt; died" in page
     assert '<tr class="mean"><td class="text">all</td>' in page
 
 
+def test_report_states_when_how_and_where_it_was_measured(result, tmp_path):
+    page = write_report(tmp_path / "report.html", LoadTest([], results=[result([0.01] * 5)]), PROVENANCE).read_text()
+    assert "<pre>catstream loadtest --limit p99=0.1 rtsp://camera/1</pre>" in page
+    assert f"{PROVENANCE['date']}, catstream {PROVENANCE['version']}, {PROVENANCE['machine']['processor']}," in page
+
+
 def test_chart_has_a_point_for_each_second(result, tmp_path):
     cores, memory = {"detector 0": 0.5, "camera": 0.1, REST: 0.2}, {"detector 0": 10**8}
     receipts = Receipts(0, "tracks", np.full((2, 50), 0.2), [50, 50], [0, 0])
     run = result([0.1] * 50, readings=[Reading(105.0, 5.0, cores, memory)], subscribers=[receipts])
-    page = write_report(tmp_path / "report.html", LoadTest([], results=[run])).read_text()
+    page = write_report(tmp_path / "report.html", LoadTest([], results=[run]), PROVENANCE).read_text()
     assert page.count("<polyline") == 4 + 2 + 3 + 1  # latencies here and of the subscribers, frames, cores, memory
     assert page.count('"100.0,50.0 300.0,50.0 500.0,50.0 700.0,50.0 900.0,50.0"') == 2  # 100 ms of 200
     assert ">5 s</text>" in page
@@ -75,7 +84,7 @@ def test_raw_file_has_a_row_for_each_frame_and_receiver(result, tmp_path):
 
 
 def test_json_report_contains_only_valid_json(result):
-    text = json.dumps(to_json(LoadTest([Limit("max", 0.001)], results=[result([0.01] * 5)])), allow_nan=False)
+    text = json.dumps(to_json(LoadTest([Limit("max", 0.001)], results=[result([0.01] * 5)]), {}), allow_nan=False)
     figures = json.loads(text)
     assert figures["limits"] == {"max": {"value": 0.001, "met": False}}
     (stream,) = figures["streams"]
