@@ -26,7 +26,7 @@ IMPORTERS = {
     "safetensors": "wire/storage.py",
     "obstore": "fleet/store.py",
     "ray": "fleet",
-    "av": "measure/mjpeg.py video",
+    "av": "measure/load_video.py measure/mjpeg.py video",
     "zmq": "client/subscription.py wire",
     "paho": "output/mqtt_sink.py",
     "msgpack": "wire/codec.py",

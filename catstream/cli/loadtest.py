@@ -25,16 +25,18 @@ from catstream.cli.common import (
     with_report_file,
     write_json,
 )
-from catstream.cli.options import NumberRange, with_settings
+from catstream.cli.options import NumberRange, with_object, with_settings
 from catstream.errors import BoxError, CatstreamError, ObjectError, SettingsError, VideoError
 
 if TYPE_CHECKING:
-    from catstream.measure.load_result import Limit, Result
+    from catstream.measure.load_result import Limit, Plan, Result
 
 _QUIET_CORES = 0.25  # load by other processes above which a warning is printed
 
 
-def _size(_: click.Context, __: click.Parameter, text: str) -> tuple[int, int]:
+def _size(_: click.Context, __: click.Parameter, text: str | None) -> tuple[int, int] | None:
+    if text is None:
+        return None
     match = re.fullmatch(r"(\d{2,4})x(\d{2,4})", text)
     if not match or min(size := (int(match[1]), int(match[2]))) < 64:
         raise click.BadParameter(f"a size is WIDTHxHEIGHT, 64x64 to 9999x9999, got {text!r}: for example 640x480")
@@ -63,7 +65,11 @@ def _usage_errors(*kinds: type[CatstreamError]) -> Iterator[None]:
 
 @click.command(cls=_LoadTest)
 @click.option("--streams", type=click.IntRange(1, 64), default=1, show_default=True, help="Number of pipelines.")
-@click.option("--objects", type=click.IntRange(1, 16), default=1, show_default=True, help="Objects of each pipeline.")
+@click.option(
+    "--video", default="", metavar="FILE", help="Recording to send over and over; by default a rendered video."
+)
+@with_object
+@click.option("--objects", type=click.IntRange(1, 16), help="Objects in the rendered video.  [default: 1]")
 @click.option(
     "--subscribers", type=click.IntRange(0, 1000), default=0, show_default=True, help="Subscribers to each pipeline."
 )
@@ -78,12 +84,12 @@ def _usage_errors(*kinds: type[CatstreamError]) -> Iterator[None]:
 )
 @click.option("--slow-subscribers", type=click.IntRange(0), default=0, help="Number of slow subscribers among them.")
 @click.option(
-    "--rate", type=NumberRange(0.5, 1000), default=25.0, show_default=True, help="Frames per second of each stream."
+    "--rate",
+    type=NumberRange(0.5, 1000),
+    help="Frames per second of each stream.  [default: the rate of the recording, or 25]",
 )
 @click.option("--duration", type=NumberRange(1, 86400), default=10.0, show_default=True, help="Duration in seconds.")
-@click.option(
-    "--size", default="640x480", show_default=True, callback=_size, metavar="WxH", help="Size of a frame in pixels."
-)
+@click.option("--size", callback=_size, metavar="WxH", help="Size of the rendered video.  [default: 640x480]")
 @click.option(
     "--source", type=click.Choice(["mjpeg", "h264"]), default="mjpeg", show_default=True, help="Over HTTP or RTSP."
 )
@@ -100,12 +106,13 @@ def loadtest(
     json_file: Path | None,
     raw_file: Path | None,
     report_file: Path | None,
-    **plan: Any,
+    **options: Any,
 ) -> None:
     """Measure latency and dropped frames of pipelines under load.
 
-    The load test sends a rendered video with ground truth as a network camera
-    does, on the loopback interface; a pipeline of its own tracks each stream.
+    The load test sends a rendered video with ground truth, or the recording
+    --video with its objects --box and --model, as a network camera does, on the
+    loopback interface; a pipeline of its own tracks each stream.
     The camera does not wait: frame i is due at start + i / RATE, and latency
     counts from then. The latency of a skipped frame ends with the track of a
     newer one. Slow subscribers read two tracks per second.
@@ -117,7 +124,8 @@ def loadtest(
       skipped                   share of frames that were not tracked, at most
       subscriber-p50 ... -max   seconds from a frame to its receipt by fast subscribers, at most
       subscriber-missed         share of frames that fast subscribers missed, at most
-      success                   share of frames with an IoU above 0.5, at least
+      success                   share of frames with an IoU above 0.5 with the ground truth,
+                                or with an unloaded run of the recording, at least
 
     Without --limit, the limits are p99=0.1 and skipped=0, or skipped=0.01 with
     --warm-up. The last line is the verdict. The exit status is 0 if the load was
@@ -129,15 +137,16 @@ def loadtest(
     EXAMPLES
       catstream loadtest --rate 30 --limit p99=0.1
       catstream loadtest --objects 8 --limit skipped=0.01
+      catstream loadtest --video recording.mp4 --box 120,80,64,48 --limit success=0.95
       catstream loadtest --subscribers 500 --limit subscriber-p99=0.05 --report load.html
       catstream loadtest --find-streams --rate 25 --size 1920x1080
     """
     from catstream.measure.load_report import milliseconds, to_json, verdict, write_raw, write_report
-    from catstream.measure.load_result import Limit, Plan, violations
+    from catstream.measure.load_result import Limit, violations
     from catstream.measure.load_test import run_load_test
     from catstream.measure.provenance import provenance
 
-    parameters = Plan(**plan)
+    parameters = _plan(**options)
     parsed = [*map(Limit.parse, limits)] or Limit.defaults(parameters)
     with line_of(
         messages(), text("{task.description}"), BarColumn(24), text("{task.fields[figures]}", last=True)
@@ -171,6 +180,19 @@ def loadtest(
     if load_test.interrupted:
         stopped("these are the results so far" if load_test.results else "there are no measurements yet")
     sys.exit(0 if load_test.sustained else 1)
+
+
+def _plan(video: str, size: tuple[int, int] | None, objects: int | None, rate: float | None, **options: Any) -> Plan:
+    from catstream.measure.load_result import Plan
+    from catstream.measure.load_video import with_recording
+
+    if video and (size or objects):
+        raise SettingsError("a recording has its own size and objects: omit --size and --objects, or --video")
+    if video:
+        return with_recording(Plan(video=video, **options), rate)
+    if options["boxes"] or options["models"]:
+        raise SettingsError("--box and --model are objects of a recording: pass --video FILE as well")
+    return Plan(size=size or (640, 480), objects=objects or 1, rate=rate or 25.0, **options)
 
 
 def _print_run(result: Result, limits: list[Limit]) -> None:

@@ -109,8 +109,8 @@ class Measures:
     track            seconds from the due time of each frame to the track of this frame or a newer one; at most to the
                      end of the run
     model            seconds to the model trained on this frame or a newer one
-    success          share of the frames with a visible object for which the IoU of box and ground truth is above 0.5; a
-                     skipped frame has the box of the last tracked frame
+    success          share of the frames with a visible object for which the IoU of box and ground truth, or box of the
+                     unloaded run, is above 0.5; a skipped frame has the box of the last tracked frame
     totals           totals of the pipeline at its end; empty if the stream has not ended
     """
 
@@ -164,12 +164,19 @@ class Receipts:
 
 
 def measure(
-    observations: Observations, schedule: Schedule, frames: int, truth: Float64, end: float, totals: dict[str, int]
+    observations: Observations,
+    schedule: Schedule,
+    frames: int,
+    truth: Float64,
+    end: float,
+    totals: dict[str, int],
+    images: int | None = None,
 ) -> Measures:
     """Compute the measures of one stream.
 
     frames : number of due frames: all of the schedule of the camera, or those before an interruption
-    truth : boxes of the object in the images, which are sent over and over, float64 (images, 4), NaN if it is absent
+    truth : boxes of the object in the first frames, float64 (n, 4), NaN if it is absent; the last `images` of them, by
+        default all, are repeated
     end : time at which the observation ended
     totals : totals of the pipeline at its end
     """
@@ -181,7 +188,9 @@ def measure(
         if 0 <= number < frames:
             boxes[number] = track.box or np.nan
     last = np.maximum.accumulate(np.where(tracked, np.arange(frames), -1))
-    true = truth[np.arange(frames) % len(truth)]
+    period = images or len(truth)
+    once, numbers = len(truth) - period, np.arange(frames)
+    true = truth[np.where(numbers < once, numbers, once + (numbers - once) % period)]
     is_success = overlaps(boxes[last], true)[np.isfinite(true).all(axis=1)] > _SUCCESS
     models = [(moment, schedule.number(newest)) for moment, newest in observations.models]
     return Measures(
@@ -189,7 +198,7 @@ def measure(
         tracked=tracked,
         track=latencies_to_answer(due, tracks, end),
         model=latencies_to_answer(due, models, end),
-        success=float(is_success.mean()),
+        success=float(is_success.mean()) if is_success.size else 1.0,  # an interrupted run may end before the object
         totals=totals,
     )
 

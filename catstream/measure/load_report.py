@@ -54,8 +54,8 @@ def tables(result: Result) -> Iterator[Table]:
         streams,
         "Cores: processor seconds per second of all processes of the stream; MB: their memory, in which a page that n "
         "processes share counts as 1/n of a page (PSS). Latencies in milliseconds. Not stored: features "
-        "messages that were not in the coreset trees at the end. Success: share of frames with an IoU with the ground "
-        "truth above 0.5; a skipped frame has the box of the last tracked frame.",
+        "messages that were not in the coreset trees at the end. Success: share of frames with an IoU above 0.5 with "
+        f"the {'unloaded run' if result.plan.video else 'ground truth'}; a skipped frame has the last box.",
     )
     if result.readings:
         processes = [{"process": name, **_cost(cores, result.memory.get(name))} for name, cores in result.cores.items()]
@@ -158,6 +158,10 @@ def to_json(load_test: LoadTest, provenance: dict[str, object]) -> dict[str, obj
     """
     result = load_test.result
     plan = {item.name: getattr(result.plan, item.name) for item in fields(result.plan) if item.name != "settings"}
+    plan |= {
+        "video": Path(result.plan.video).name,
+        "models": {name: file.name for name, file in plan["models"].items()},
+    }
     return {
         **provenance,
         "settings": result.plan.settings.changed(),

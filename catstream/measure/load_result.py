@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
+from pathlib import Path
 from statistics import fmean
 
 import numpy as np
 
 from catstream.base.arrays import Float64
+from catstream.base.box import Box
 from catstream.base.names import check_count
 from catstream.base.settings import Settings
 from catstream.base.text import counted
@@ -44,6 +46,8 @@ class Plan:
     rate              frames per second of each stream, whether or not the pipeline keeps up
     duration          seconds
     size              (width, height) of a frame in pixels
+    video             recording that the camera sends over and over; empty for the rendered video
+    boxes, models     objects of the recording: boxes in its first frame, and files of saved models, by name
     source            "mjpeg" (over HTTP) or "h264" (over RTSP)
     warm_up           whether the training of the first models is measured as well
     settings          settings of all pipelines
@@ -58,6 +62,9 @@ class Plan:
     duration: float = 10.0
     size: tuple[int, int] = rendered.SIZE
     source: str = "mjpeg"
+    video: str = ""
+    boxes: dict[str, Box] = field(default_factory=dict)
+    models: dict[str, Path] = field(default_factory=dict)
     warm_up: bool = False
     settings: Settings = field(default_factory=Settings)
 
@@ -83,7 +90,7 @@ class Plan:
 
     def __str__(self) -> str:
         objects = f", {self.objects} objects" if self.objects > 1 else ""
-        video = f"{self.size[0]}x{self.size[1]} pixels ({self.source})"
+        video = f"{Path(self.video).name + ', ' * bool(self.video)}{self.size[0]}x{self.size[1]} pixels ({self.source})"
         return f"{counted(self.streams, 'stream')} of {video}{objects}, {self.rate:g} frames/s due in each"
 
     @property

@@ -12,8 +12,9 @@ from time import monotonic
 from catstream.errors import ServiceError, errors_in
 from catstream.measure.camera import Camera, Schedule
 from catstream.measure.latency import Observations, Usage, measure, observed
-from catstream.measure.load import Stream, Video, render
+from catstream.measure.load import Stream
 from catstream.measure.load_result import Limit, Plan, Report, Result, violations
+from catstream.measure.load_video import Video, prepare
 from catstream.measure.subscribers import Subscribers
 
 MOST_STREAMS = 64  # of a load test
@@ -29,8 +30,8 @@ def run(plan: Plan, video: Video, report: Report) -> Result:
     usage, interrupted = Usage(), False
     with ExitStack() as stack:
         camera = stack.enter_context(Camera(plan.source, plan.size, video.units, video.still, plan.streams))
-        streams = [Stream(number, url, video.boxes, plan.settings) for number, url in enumerate(camera.urls)]
-        observations, groups = _started(plan, streams, next(iter(video.boxes)), stack, report)
+        streams = [Stream(number, url, video, plan.settings) for number, url in enumerate(camera.urls)]
+        observations, groups = _started(plan, streams, video, stack, report)
 
         def processes() -> dict[str, list[int]]:
             pids = {f"{name} {stream.number}": [pid] for stream in streams for name, pid in stream.pids.items()}
@@ -66,7 +67,7 @@ def run(plan: Plan, video: Video, report: Report) -> Result:
         plan=plan,
         seconds=min(due) / plan.rate,
         streams=[
-            measure(observation, schedule, number, video.truth, end, stream.totals)
+            measure(observation, schedule, number, video.truth, end, stream.totals, len(video.units))
             for observation, schedule, number, stream in zip(observations, schedules, due, streams, strict=True)
         ],
         readings=usage.readings,
@@ -78,7 +79,7 @@ def run(plan: Plan, video: Video, report: Report) -> Result:
 
 
 def _started(
-    plan: Plan, streams: list[Stream], name: str, stack: ExitStack, report: Report
+    plan: Plan, streams: list[Stream], video: Video, stack: ExitStack, report: Report
 ) -> tuple[list[Observations], list[Subscribers]]:
     """Start the pipelines, wait for their first models, then connect the subscribers; the stack ends all of them."""
 
@@ -102,8 +103,8 @@ def _started(
         stream.start()
     wait_until(lambda: all(stream.ready.is_set() for stream in streams), "starting processes")
     addresses = [stream.address for stream in streams if stream.address is not None]
-    observations = stack.enter_context(observed(addresses, name))
-    if plan.warm_up:
+    observations = stack.enter_context(observed(addresses, next(iter(video.boxes | video.models))))
+    if plan.warm_up or not video.boxes:  # the object of a saved model need not be in the first frame
         wait_until(lambda: all(stream.tracks for stream in observations), "waiting for the first tracks")
     else:
         wait_until(lambda: all(stream.warmed_up for stream in observations), "learning the first models")
@@ -206,7 +207,7 @@ def run_load_test(
         return not violations(limits, result)
 
     try:
-        video = render(plan, report)
+        video = prepare(plan, plan.frames, report)
         if find:
             load_test.highest = find_highest(plan.streams, holds, MOST_STREAMS)
         else:

@@ -45,6 +45,16 @@ def test_run_counts_every_frame_and_prints_the_violated_limit(said, tmp_path):
     assert not re.search(r"(src|href)=|<script|@import|url\(|nan", page)
 
 
+def test_recording_is_compared_with_an_unloaded_run(succeed, demo_video, tmp_path):
+    path, boxes = demo_video(32)
+    arguments = ["--video", path, "--box", f"dahlia={boxes[0]}", "--source", "h264", "--duration", 2]
+    output, _ = succeed("loadtest", *arguments, "--limit", "skipped=1", "--json", "x.json", cwd=tmp_path)
+    assert "Sustained: 1 stream of demo.mp4, 320x240 pixels (h264), 30 frames/s" in output
+    figures = json.loads((tmp_path / "x.json").read_text())
+    assert figures["streams"][0]["success"] > 0
+    assert (figures["plan"]["video"], [*figures["plan"]["boxes"]]) == ("demo.mp4", ["dahlia"])
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -53,6 +63,9 @@ def test_run_counts_every_frame_and_prints_the_violated_limit(said, tmp_path):
         (["--report", "/dev/null/load.html"], "cannot write"),
         (["--set", "run.lockstep=true"], "omit run.lockstep"),
         (["--set", "run.nothing=1"], "run.nothing"),
+        (["--video", "none.mp4", "--box", "1,1,9,9"], "there is no video or folder"),
+        (["--video", "none.mp4", "--size", "640x480"], "omit --size and --objects"),
+        (["--box", "1,1,9,9"], "pass --video FILE as well"),
     ],
 )
 def test_invalid_arguments_are_usage_errors_before_the_start(fail, tmp_path, arguments, message):

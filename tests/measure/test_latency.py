@@ -38,6 +38,12 @@ def test_success_compares_the_last_box_with_the_truth_of_each_frame_with_an_obje
     assert measures.success == 3 / 8  # 0 and 1 have no box yet; 7 and 8 have the wrong one of 6
 
 
+def test_success_repeats_the_last_repetition_of_the_video(schedule, track):
+    boxes = np.array([BOX, BOX._replace(x=99.0), BOX, BOX])  # two repetitions of two images
+    observations = Observations(tracks=[track(number, 0.02) for number in range(10)])
+    assert measure(observations, schedule, 10, boxes, end=102.0, totals={}, images=2).success == 9 / 10
+
+
 def test_still_frames_before_and_after_a_run_count_only_for_the_time_within_it(schedule, track):
     observations = Observations(tracks=[track(-3, 0.01), track(4, 0.01), track(12, 0.01)])
     measures = measure(observations, schedule, 10, TRUTH, end=105.0, totals={})

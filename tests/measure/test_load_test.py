@@ -63,7 +63,7 @@ def machine(monkeypatch, result):
             return run
 
         monkeypatch.setattr(module, "run", run)
-        monkeypatch.setattr(module, "render", lambda *_: None)
+        monkeypatch.setattr(module, "prepare", lambda *_: None)
         return tried
 
     return made
