@@ -25,7 +25,7 @@ from catstream.cli.common import (
     with_report_file,
     write_json,
 )
-from catstream.cli.options import NumberRange, with_object, with_settings
+from catstream.cli.options import PATH, NumberRange, with_object, with_settings
 from catstream.errors import BoxError, CatstreamError, ObjectError, SettingsError, VideoError
 
 if TYPE_CHECKING:
@@ -43,7 +43,7 @@ def _size(_: click.Context, __: click.Parameter, text: str | None) -> tuple[int,
     return size
 
 
-class _LoadTest(click.Command):
+class _LoadTest(click.Group):
     """Exits with 2 if the arguments are invalid, because 1 states that the load was not sustained."""
 
     def make_context(self, *arguments: Any, **options: Any) -> click.Context:
@@ -63,7 +63,7 @@ def _usage_errors(*kinds: type[CatstreamError]) -> Iterator[None]:
         raise click.UsageError(str(error)) from None
 
 
-@click.command(cls=_LoadTest)
+@click.group(cls=_LoadTest, invoke_without_command=True)
 @click.option("--streams", type=click.IntRange(1, 64), default=1, show_default=True, help="Number of pipelines.")
 @click.option(
     "--video", default="", metavar="FILE", help="Recording to send over and over; by default a rendered video."
@@ -141,6 +141,8 @@ def loadtest(
       catstream loadtest --subscribers 500 --limit subscriber-p99=0.05 --report load.html
       catstream loadtest --find-streams --rate 25 --size 1920x1080
     """
+    if click.get_current_context().invoked_subcommand is not None:
+        return
     from catstream.measure.load_report import milliseconds, to_json, verdict, write_raw, write_report
     from catstream.measure.load_result import Limit, violations
     from catstream.measure.load_test import run_load_test
@@ -214,3 +216,46 @@ def _print_run(result: Result, limits: list[Limit]) -> None:
     for limit in limits:
         met = click.style("met", "green") if limit.is_met(result) else click.style("not met", "red")
         click.echo(f"{met}: {limit.describe(result)}")
+
+
+def _tolerance(_: click.Context, __: click.Parameter, text: str) -> float:
+    match = re.fullmatch(r"(\d+(?:\.\d+)?) ?%", text)
+    if not match:
+        raise click.BadParameter(f"a tolerance is a percentage, got {text!r}: for example 10%")
+    return float(match[1]) / 100
+
+
+@loadtest.command()
+@click.argument("before", type=PATH)
+@click.argument("after", type=PATH)
+@click.option(
+    "--tolerance", default="10%", show_default=True, callback=_tolerance, help="Share by which a figure may be worse."
+)
+def compare(before: Path, after: Path, tolerance: float) -> None:
+    """Compare two results of `catstream loadtest --json`.
+
+    The exit status is 1 if a figure of AFTER is worse than in BEFORE by more than
+    the tolerance, 2 if the results have different plans, and 0 otherwise. Of two
+    searches, the numbers that they have found are compared. p99.9 and max are
+    only shown: they are the latencies of single frames.
+
+    \b
+    EXAMPLES
+      catstream loadtest --json before.json
+      catstream loadtest --json after.json
+      catstream loadtest compare before.json after.json --tolerance 20%
+    """
+    from catstream.measure.load_compare import compare, read_result
+    from catstream.measure.load_report import figure
+
+    changes = compare(read_result(before), read_result(after), tolerance)
+    output = table("figure", "before", "after", "worse by", "", right=("before", "after", "worse by"))
+    for name, *values, worse, is_regression in changes:
+        share = "-" if not worse else f"{100 * worse:+.1f} %"
+        output.add_row(name, *(figure(name, value) for value in values), share, "regression" * is_regression)
+    screen().print(output)
+    worst = [change.name for change in changes if change.is_regression]
+    click.echo(
+        f"Regression: {', '.join(worst)}." if worst else f"No figure is worse by more than {100 * tolerance:g} %."
+    )
+    sys.exit(1 if worst else 0)

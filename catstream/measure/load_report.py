@@ -12,7 +12,7 @@ import numpy as np
 from catstream.base.arrays import Float64
 from catstream.base.tables import write_table
 from catstream.measure.latency import PERCENTILES, percentiles
-from catstream.measure.load_result import Result, violations
+from catstream.measure.load_result import KINDS, SHARES, Result, violations
 from catstream.measure.load_test import MOST_STREAMS, LoadTest
 from catstream.output.report import COLOURS, round_up, write_page
 
@@ -142,6 +142,19 @@ def milliseconds(seconds: float | None) -> str:
     return f"{1000 * seconds:.3g}" if seconds < 1 else f"{1000 * seconds:.0f}"
 
 
+def figure(name: str, value: float) -> str:
+    """Format a figure by its name, with its unit.
+
+    >>> figure("p99", 0.0234), figure("skipped", 0.005), figure("memory", 2e8), figure("cores", 0.3)
+    ('23.4 ms', '0.5 %', '200 MB', '0.30')
+    """
+    if name in SHARES:
+        return f"{100 * value:.4g} %"
+    if name == "memory":
+        return f"{value / 1e6:.0f} MB"
+    return f"{value:.2f}" if name == "cores" else f"{milliseconds(value)} ms" if name in KINDS else f"{value:g}"
+
+
 def _latencies(track: Float64, model: Float64) -> dict[str, str]:
     of_model = {f"model {name}": percentiles(model)[name] for name in ("p50", "p99")}
     return {name: milliseconds(seconds) for name, seconds in (percentiles(track) | of_model).items()}
@@ -198,18 +211,24 @@ def to_json(load_test: LoadTest, provenance: dict[str, object]) -> dict[str, obj
         "sustained": load_test.sustained,
         "verdict": verdict(load_test),
         "violations": violations(load_test.limits, result),
-        "highest_streams": load_test.highest,
+        "figures": _figures(result),
+        "find": "streams" if load_test.find else None,
+        "highest": load_test.highest,
         "steps": [
             {
                 "streams": step.plan.streams,
-                **step.worst,
-                **dict(zip(("cores", "memory"), step.mean_cost, strict=True)),
+                **_figures(step),
                 "violations": violations(load_test.limits, step),
             }
             for step in load_test.results
         ],
         "refused": {str(streams): reason for streams, reason in load_test.refused.items()},
     }
+
+
+def _figures(result: Result) -> dict[str, float]:
+    """The figures of the worst stream, and the mean use of cores and memory of a stream."""
+    return {**result.worst, **dict(zip(("cores", "memory"), result.mean_cost, strict=True))}
 
 
 def write_report(path: Path, load_test: LoadTest, provenance: dict[str, object]) -> Path:

@@ -28,7 +28,8 @@ KINDS = {
     "subscriber-missed": "share of frames that fast subscribers missed",
     "success": "share of frames with an IoU above 0.5",
 }
-_SHARES = ("skipped", "subscriber-missed", "success")  # the other figures are times
+#: Those that are shares; the others are times.
+SHARES = ("skipped", "subscriber-missed", "success")
 
 #: Is called about ten times a second with the current activity, the share of it that is done, and current figures.
 Report = Callable[[str, float, str], None]
@@ -214,7 +215,7 @@ class Limit:
     def describe(self, result: Result) -> str:
         """The figure and its limit, times in milliseconds, as in the tables."""
         value, limit = (
-            f"{number:.4g}" if self.name in _SHARES else f"{1000 * number:.4g} ms"
+            f"{number:.4g}" if self.name in SHARES else f"{1000 * number:.4g} ms"
             for number in (result.worst[self.name], self.value)
         )
         sense = "least" if self.name == "success" else "most"

@@ -6,7 +6,7 @@ import re
 import pytest
 
 
-def test_run_counts_every_frame_and_prints_the_violated_limit(said, tmp_path):
+def test_run_counts_every_frame_and_prints_the_violated_limit(said, succeed, tmp_path):
     arguments = ["--rate", 20, "--duration", 3, "--size", "320x240", "--subscribers", 3, "--slow-subscribers", 2]
     limits = ["--limit", "max=0", "--limit", "subscriber-missed=1"]
     code, output, errors = said(
@@ -40,6 +40,11 @@ def test_run_counts_every_frame_and_prints_the_violated_limit(said, tmp_path):
     assert min(figures["timeline"]["cores"]) > 0
     assert len((tmp_path / "x.csv").read_text().splitlines()) == 1 + 60 * (2 + 1)  # tracks, models, one fast subscriber
 
+    succeed("loadtest", "compare", "x.json", "x.json", cwd=tmp_path)
+    (tmp_path / "y.json").write_text(json.dumps({**figures, "figures": {**figures["figures"], "p50": 60.0}}))
+    code, output, _ = said("loadtest", "compare", "x.json", "y.json", "--tolerance", "20%", cwd=tmp_path)
+    assert (code, output.splitlines()[-1]) == (1, "Regression: p50.")
+
     page = (tmp_path / "load.html").read_text()
     assert "<h2>Streams</h2>" in page
     assert not re.search(r"(src|href)=|<script|@import|url\(|nan", page)
@@ -66,6 +71,8 @@ def test_recording_is_compared_with_an_unloaded_run(succeed, demo_video, tmp_pat
         (["--video", "none.mp4", "--box", "1,1,9,9"], "there is no video or folder"),
         (["--video", "none.mp4", "--size", "640x480"], "omit --size and --objects"),
         (["--box", "1,1,9,9"], "pass --video FILE as well"),
+        (["compare", "none.json", "none.json"], "none.json is not a result of a load test"),
+        (["compare", "none.json", "none.json", "--tolerance", "0.1"], "a tolerance is a percentage"),
     ],
 )
 def test_invalid_arguments_are_usage_errors_before_the_start(fail, tmp_path, arguments, message):

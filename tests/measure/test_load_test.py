@@ -85,7 +85,7 @@ def test_number_of_streams_is_doubled_or_halved_and_bisected(machine, facts, sta
     assert (tried, load_test.highest) == (steps, highest)
     assert load_test.result.plan.streams == (highest or 1)
     assert load_test.sustained == bool(highest)
-    assert to_json(load_test, {})["highest_streams"] == highest
+    assert to_json(load_test, {})["highest"] == highest
 
 
 def test_streams_that_do_not_start_are_a_step_of_a_search_but_not_the_first_one(machine):

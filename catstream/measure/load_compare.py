@@ -1,0 +1,68 @@
+"""Compares two results of a load test that `catstream loadtest --json` wrote."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from catstream.errors import SettingsError
+
+
+class Change(NamedTuple):
+    """A figure of two results.
+
+    name           as of a limit; or `cores` and `memory`, of a stream, or what was searched for
+    before, after  its values, in seconds, bytes, or a share from 0 to 1
+    worse          by which share of `before` it is worse, negative if it is better; infinite if it was 0
+    is_regression  whether this is more than the tolerance
+    """
+
+    name: str
+    before: float
+    after: float
+    worse: float
+    is_regression: bool
+
+
+def read_result(path: Path) -> dict[str, Any]:
+    """Read the JSON file of a load test. SettingsError if it is none."""
+    try:
+        result: dict[str, Any] = json.loads(path.read_bytes())
+        _ = result["plan"]["rate"], result["figures"]["p99"], result["find"], result["highest"], result["settings"]
+    except (OSError, ValueError, TypeError, KeyError):
+        raise SettingsError(
+            f"{path} is not a result of a load test: pass a file that `catstream loadtest --json` of this version wrote"
+        ) from None
+    return result
+
+
+def compare(before: dict[str, Any], after: dict[str, Any], tolerance: float) -> list[Change]:
+    """Return the figures of two results of the same plan.
+
+    p99.9 and max are never a regression, because they are the latencies of single frames. Of two searches, the numbers
+    that they have found are compared. Raises SettingsError for different plans.
+
+    tolerance : share by which a figure may be worse
+    """
+    find = before["find"]
+    plans = [
+        {**each["plan"], **{key: each[key] for key in ("settings", "interrupted", "find")}} for each in (before, after)
+    ]
+    differ = [key for key in sorted(plans[0].keys() | plans[1].keys()) if plans[0].get(key) != plans[1].get(key)]
+    if lines := [f"{key} ({plans[0].get(key)}, {plans[1].get(key)})" for key in differ if key != find]:
+        raise SettingsError(
+            f"the results have different plans: {', '.join(lines)}; repeat one load test like the other"
+        )
+    if find:
+        return [_change(f"highest {find}", before["highest"] or 0, after["highest"] or 0, tolerance)]
+    return [
+        _change(name, value, after["figures"].get(name, 0.0), tolerance) for name, value in before["figures"].items()
+    ]
+
+
+def _change(name: str, before: float, after: float, tolerance: float) -> Change:
+    loss = before - after if name == "success" or name.startswith("highest") else after - before
+    worse = loss / before if before else math.copysign(math.inf, loss) if loss else 0.0
+    return Change(name, before, after, worse, worse > tolerance and not name.endswith(("p99.9", "max")))
