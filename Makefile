@@ -70,7 +70,7 @@ docs: $(TOOLS)  ## the documentation, into site/
 wheel:  ## build sdist and wheel in dist/, and try them on each supported Python of this machine: some minutes
 	@PYTHON=$(PYTHON) .ci/wheel
 
-picture: $(READY)  ## render the animated picture of README.md
+picture: $(READY)  ## render the animated picture of the tutorial
 	@$(BIN)/python .ci/picture
 
 protocol: $(TOOLS)  ## update the fields in docs/protocol.md

@@ -338,8 +338,8 @@ def summary(records: Records) -> str:
     return _paragraph(f"""
         **AUC {auc["catstream"]:.3f} on {len(records.sequences("accuracy"))} public sequences** (area under the success
         plot; OpenCV's CSRT {auc["csrt"]:.3f}). On the {len(new)} that were not used to choose the defaults it reaches
-        {on_new["catstream"]:.3f}, CSRT {on_new["csrt"]:.3f}, and NanoTrackV3, a network that was trained on many
-        videos, {on_new["nano-v3"]:.3f}. **{rates["catstream, three processes"]:.0f} frames/s** on
+        {on_new["catstream"]:.3f}, CSRT {on_new["csrt"]:.3f}, and NanoTrackV3, a network of 2022 that was trained on
+        many videos, {on_new["nano-v3"]:.3f}. **{rates["catstream, three processes"]:.0f} frames/s** on
         {records["speed"]["machine"]["cores"]} cores with decoding, at about 320x240 pixels;
         {rates["catstream, one core"]:.0f} on one core without decoding (CSRT {rates["csrt, one core"]:.0f}). See
         [Results](docs/results.md).""")
