@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any
 import click
 from rich.progress import BarColumn
 
-from catstream.base.text import counted
 from catstream.cli.common import (
     line_of,
     messages,
@@ -94,14 +93,18 @@ def _usage_errors(*kinds: type[CatstreamError]) -> Iterator[None]:
     "--source", type=click.Choice(["mjpeg", "h264"]), default="mjpeg", show_default=True, help="Over HTTP or RTSP."
 )
 @click.option("--warm-up", is_flag=True, help="Measure the training of the first models as well.")
-@click.option("--find-streams", is_flag=True, help="Search for the highest number of streams that meets the limits.")
+@click.option(
+    "--find",
+    type=click.Choice(["streams", "rate", "subscribers"]),
+    help="Search for the highest number within the limits.",
+)
 @click.option("--limit", "limits", multiple=True, metavar="NAME=VALUE", help="Limit to meet, see above; repeatable.")
 @with_json_file
 @with_raw_file
 @with_report_file
 @with_settings
 def loadtest(
-    find_streams: bool,
+    find: str | None,
     limits: tuple[str, ...],
     json_file: Path | None,
     raw_file: Path | None,
@@ -130,8 +133,9 @@ def loadtest(
     Without --limit, the limits are p99=0.1 and skipped=0, or skipped=0.01 with
     --warm-up. The last line is the verdict. The exit status is 0 if the load was
     sustained (no stream failed, and all limits are met), 1 if it was not, and 2
-    if the arguments are invalid. With --find-streams, the load test searches for
-    the number of cameras that this machine can serve, starting with STREAMS.
+    if the arguments are invalid. With --find, the load test searches for the
+    highest number that is sustained in two runs, starting with the given one. The
+    limits of subscribers then are subscriber-p99=0.1 and subscriber-missed=0 too.
 
     \b
     EXAMPLES
@@ -139,7 +143,7 @@ def loadtest(
       catstream loadtest --objects 8 --limit skipped=0.01
       catstream loadtest --video recording.mp4 --box 120,80,64,48 --limit success=0.95
       catstream loadtest --subscribers 500 --limit subscriber-p99=0.05 --report load.html
-      catstream loadtest --find-streams --rate 25 --size 1920x1080
+      catstream loadtest --find streams --rate 25 --size 1920x1080
     """
     if click.get_current_context().invoked_subcommand is not None:
         return
@@ -149,7 +153,7 @@ def loadtest(
     from catstream.measure.provenance import provenance
 
     parameters = _plan(**options)
-    parsed = [*map(Limit.parse, limits)] or Limit.defaults(parameters)
+    parsed = [*map(Limit.parse, limits)] or Limit.defaults(parameters, find)
     with line_of(
         messages(), text("{task.description}"), BarColumn(24), text("{task.fields[figures]}", last=True)
     ) as progress:
@@ -159,17 +163,17 @@ def loadtest(
             progress.update(task, description=activity, completed=share, figures=figures)
 
         def done(result: Result) -> None:
-            if find_streams:
+            if find:
                 (cores, memory), verdict = result.mean_cost, "; ".join(violations(parsed, result)) or "met"
                 click.echo(
-                    f"{counted(result.plan.streams, 'stream')}, {result.plan.rate:g} frames/s due; in the worst stream "
-                    f"{result.rate(result.worst['skipped']):.1f} tracked, p99 {milliseconds(result.worst['p99'])} ms; "
-                    f"each takes {cores:.2f} cores, {memory / 1e6:.0f} MB: {verdict}"
+                    f"{result.plan.number(find)}: in the worst stream, {result.rate(result.worst['skipped']):.1f} "
+                    f"frames/s tracked, p99 {milliseconds(result.worst['p99'])} ms; each takes {cores:.2f} cores, "
+                    f"{memory / 1e6:.0f} MB: {verdict}"
                 )
 
-        load_test = run_load_test(parameters, parsed, find=find_streams, report=report, done=done)
-    for streams, reason in load_test.refused.items():
-        click.echo(f"{streams} streams did not start: {reason}")
+        load_test = run_load_test(parameters, parsed, find=find, report=report, done=done)
+    for number, reason in load_test.refused.items():
+        click.echo(f"{number} did not start: {reason}")
     if load_test.results:
         made = provenance(["catstream", *sys.argv[1:]])
         _print_run(load_test.result, parsed)

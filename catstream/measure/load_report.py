@@ -12,8 +12,8 @@ import numpy as np
 from catstream.base.arrays import Float64
 from catstream.base.tables import write_table
 from catstream.measure.latency import PERCENTILES, percentiles
-from catstream.measure.load_result import KINDS, SHARES, Result, violations
-from catstream.measure.load_test import MOST_STREAMS, LoadTest
+from catstream.measure.load_result import KINDS, SEARCHES, SHARES, Result, violations
+from catstream.measure.load_test import LoadTest
 from catstream.output.report import COLOURS, round_up, write_page
 
 
@@ -212,17 +212,17 @@ def to_json(load_test: LoadTest, provenance: dict[str, object]) -> dict[str, obj
         "verdict": verdict(load_test),
         "violations": violations(load_test.limits, result),
         "figures": _figures(result),
-        "find": "streams" if load_test.find else None,
+        "find": load_test.find,
         "highest": load_test.highest,
         "steps": [
             {
-                "streams": step.plan.streams,
+                **{name: getattr(step.plan, name) for name in SEARCHES},
                 **_figures(step),
                 "violations": violations(load_test.limits, step),
             }
             for step in load_test.results
         ],
-        "refused": {str(streams): reason for streams, reason in load_test.refused.items()},
+        "refused": {str(number): reason for number, reason in load_test.refused.items()},
     }
 
 
@@ -258,14 +258,17 @@ def write_report(path: Path, load_test: LoadTest, provenance: dict[str, object])
 
 
 def verdict(load_test: LoadTest) -> str:
-    """State in one sentence whether the load was sustained, or the highest number of streams that was."""
+    """State in one sentence whether the load was sustained, or the highest number that was, with its costs."""
     result, reasons = load_test.result, "; ".join(violations(load_test.limits, load_test.result))
-    if load_test.find and not (reasons or result.interrupted):
-        (cores, memory), plan = result.mean_cost, result.plan
-        is_least = load_test.interrupted or plan.streams == MOST_STREAMS
+    if load_test.find and load_test.highest:
+        is_least = load_test.interrupted or load_test.highest == SEARCHES[load_test.find]
         start = "Interrupted" if load_test.interrupted else "Sustained"
-        most = "at least" if is_least else "at most"
-        return f"{start}: {most} {plan}; a stream takes {cores:.2f} cores and {memory / 1e6:.0f} MB."
+        most, number, (cores, memory) = (
+            "least" if is_least else "most",
+            result.plan.number(load_test.find),
+            result.mean_cost,
+        )
+        return f"{start}: at {most} {number}: {result.plan}; a stream takes {cores:.2f} cores, {memory / 1e6:.0f} MB."
     if load_test.interrupted:
         return f"Interrupted after {result.seconds:.1f} s: no verdict on {result.plan}."
     return f"Not sustained: {result.plan}: {reasons}." if reasons else f"Sustained: {result.plan}."
@@ -274,7 +277,7 @@ def verdict(load_test: LoadTest) -> str:
 def _steps(load_test: LoadTest) -> Table:
     rows = [
         {
-            "streams": f"{step.plan.streams}",
+            str(load_test.find): str(load_test.number(step)),
             "limits": "exceeded" if violations(load_test.limits, step) else "met",
             "tracked": f"{step.rate(step.worst['skipped']):.1f}",
             "skipped": f"{100 * step.worst['skipped']:.1f} %",
@@ -283,6 +286,6 @@ def _steps(load_test: LoadTest) -> Table:
         }
         for step in load_test.results
     ]
-    refused = "".join(f" {streams} streams did not start: {reason}." for streams, reason in load_test.refused.items())
+    refused = "".join(f" {number} did not start: {reason}." for number, reason in load_test.refused.items())
     note = f"The runs, in this order, with the figures of the worst stream; cores and MB are means.{refused}"
     return Table("Steps of the search", rows, note)

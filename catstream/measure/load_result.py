@@ -31,6 +31,9 @@ KINDS = {
 #: Those that are shares; the others are times.
 SHARES = ("skipped", "subscriber-missed", "success")
 
+#: The parameters whose highest number can be searched for, by name, and the highest one that is tried.
+SEARCHES = {"streams": 64, "rate": 1000, "subscribers": 1000}
+
 #: Is called about ten times a second with the current activity, the share of it that is done, and current figures.
 Report = Callable[[str, float, str], None]
 
@@ -92,7 +95,12 @@ class Plan:
     def __str__(self) -> str:
         objects = f", {self.objects} objects" if self.objects > 1 else ""
         video = f"{Path(self.video).name + ', ' * bool(self.video)}{self.size[0]}x{self.size[1]} pixels ({self.source})"
-        return f"{counted(self.streams, 'stream')} of {video}{objects}, {self.rate:g} frames/s due in each"
+        subscribers = f", {counted(self.subscribers, 'subscriber')} to each" if self.subscribers else ""
+        return f"{counted(self.streams, 'stream')} of {video}{objects}, {self.rate:g} frames/s due in each{subscribers}"
+
+    def number(self, name: str) -> str:
+        """One of the `SEARCHES` with its unit."""
+        return f"{self.rate:g} frames/s" if name == "rate" else counted(getattr(self, name), name.removesuffix("s"))
 
     @property
     def frames(self) -> int:
@@ -204,9 +212,13 @@ class Limit:
         return cls(name, value)
 
     @classmethod
-    def defaults(cls, plan: Plan) -> list[Limit]:
-        """Return the limits of a load test without any: p99 of 0.1 s, no skipped frame (1 % with the warm-up)."""
-        return [cls("p99", 0.1), cls("skipped", 0.01 if plan.warm_up else 0.0)]
+    def defaults(cls, plan: Plan, find: str | None = None) -> list[Limit]:
+        """Return the limits of a load test without any: p99 of 0.1 s, no skipped frame (1 % with the warm-up).
+
+        In a search for the number of subscribers, the same holds for their p99 and the frames that they miss.
+        """
+        limits = [cls("p99", 0.1), cls("skipped", 0.01 if plan.warm_up else 0.0)]
+        return limits + [cls("subscriber-p99", 0.1), cls("subscriber-missed", 0.0)] * (find == "subscribers")
 
     def is_met(self, result: Result) -> bool:
         value = result.worst[self.name]

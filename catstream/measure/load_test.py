@@ -1,4 +1,4 @@
-"""A load test: a single run, and the search for the highest number of streams."""
+"""A load test: a single run, and the search for the highest number of streams, frames per second or subscribers."""
 
 from __future__ import annotations
 
@@ -6,23 +6,28 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
+from functools import partial
+from math import inf
 from os import getpid
 from time import monotonic
 
+from catstream.client.address import Address
 from catstream.errors import ServiceError, errors_in
 from catstream.measure.camera import Camera, Schedule
 from catstream.measure.latency import Observations, Usage, measure, observed
 from catstream.measure.load import Stream
-from catstream.measure.load_result import Limit, Plan, Report, Result, violations
+from catstream.measure.load_result import SEARCHES, Limit, Plan, Report, Result, violations
 from catstream.measure.load_video import Video, prepare
 from catstream.measure.subscribers import Subscribers
 
-MOST_STREAMS = 64  # of a load test
 _START_TIMEOUT_SECONDS = 120.0  # for each phase of the start
 _LEAD_SECONDS = 0.5  # from the end of the start to the first frame, and half a frame: a still is no nearer to it
 _GRACE_SECONDS = 3.0  # to wait for the track of the last frame
 _READING_SECONDS = 1.0  # between two readings of processor and memory use
 _LOOP_SECONDS = 0.05
+_PRECISION = 0.05  # share by which the result of a search may be too low
+_SEARCH_FRAMES = 1200  # of the video in a search for the rate: the whole rendered video
+_FIRST_SUBSCRIBERS = 50  # of a search without another number
 
 
 def run(plan: Plan, video: Video, report: Report) -> Result:
@@ -81,11 +86,13 @@ def run(plan: Plan, video: Video, report: Report) -> Result:
 def _started(
     plan: Plan, streams: list[Stream], video: Video, stack: ExitStack, report: Report
 ) -> tuple[list[Observations], list[Subscribers]]:
-    """Start the pipelines, wait for their first models, then connect the subscribers; the stack ends all of them."""
+    """Start one pipeline after the other, each with its first models, then the subscribers; the stack ends all."""
+    started: list[Stream] = []
+    observations: list[Observations] = []
 
     def wait_until(condition: Callable[[], bool], activity: str) -> None:
         deadline = monotonic() + _START_TIMEOUT_SECONDS
-        while not condition() and not any(stream.error for stream in streams):
+        while not condition() and not any(stream.error for stream in started):
             if monotonic() > deadline:
                 raise ServiceError(
                     f"{activity} took more than {_START_TIMEOUT_SECONDS:.0f} s: the machine is too slow or too busy; "
@@ -93,21 +100,27 @@ def _started(
                 )
             report(activity, 0.0, "")
             time.sleep(_LOOP_SECONDS)
-        for stream in streams:
+        for stream in started:
             if stream.error is not None:
                 with errors_in(f"stream {stream.number}", ServiceError):
                     raise stream.error
 
-    stack.callback(_stop, streams)
+    stack.callback(_stop, started)
+    # The object of a saved model need not be in the first frame, so that nothing may be learned from it.
+    counts_from_first_track = plan.warm_up or not video.boxes
+
+    def has_begun(stream: Observations) -> bool:
+        return bool(stream.tracks) if counts_from_first_track else stream.warmed_up
+
+    addresses: list[Address] = []
     for stream in streams:
+        of_all = f"{stream.number + 1} of {len(streams)}"
         stream.start()
-    wait_until(lambda: all(stream.ready.is_set() for stream in streams), "starting processes")
-    addresses = [stream.address for stream in streams if stream.address is not None]
-    observations = stack.enter_context(observed(addresses, next(iter(video.boxes | video.models))))
-    if plan.warm_up or not video.boxes:  # the object of a saved model need not be in the first frame
-        wait_until(lambda: all(stream.tracks for stream in observations), "waiting for the first tracks")
-    else:
-        wait_until(lambda: all(stream.warmed_up for stream in observations), "learning the first models")
+        started.append(stream)
+        wait_until(stream.ready.is_set, f"starting stream {of_all}")
+        addresses += [stream.address] if stream.address is not None else []
+        observations += stack.enter_context(observed(addresses[-1:], next(iter(video.boxes | video.models))))
+        wait_until(partial(has_begun, observations[-1]), f"learning the first models of stream {of_all}")
     groups = [
         Subscribers(plan, number, channel, address)
         for number, address in enumerate(addresses if plan.subscribers else ())
@@ -151,25 +164,35 @@ class LoadTest:
     """The runs of a load test.
 
     limits       the limits of each run
-    find         whether the highest number of streams is searched for
+    find         the parameter whose highest number is searched for, one of `SEARCHES`; None for a single run
     results      all runs, in order; empty if it was interrupted before the first measurement
-    highest      the highest number of streams that meets the limits; None without a search, or if there is none
-    refused      reasons why so many streams did not start, by their number
+    refused      reasons why streams did not start, by the number that was tried
     interrupted  whether it was interrupted
     """
 
     limits: list[Limit]
-    find: bool = False
+    find: str | None = None
     results: list[Result] = field(default_factory=list)
-    highest: int | None = None
     refused: dict[int, str] = field(default_factory=dict)
     interrupted: bool = False
 
+    def number(self, result: Result) -> int:
+        """The number of a run of the search."""
+        return int(getattr(result.plan, self.find or "streams"))
+
     @property
     def result(self) -> Result:
-        """The decisive run: the one with the most streams that meets the limits, or the last one if none does."""
-        passed = [result for result in self.results if not (result.interrupted or violations(self.limits, result))]
-        return max(passed, key=lambda result: result.plan.streams, default=self.results[-1])
+        """The decisive run: the last one with the highest number below all that failed, or the last one without any."""
+        runs = [result for result in self.results if not result.interrupted]
+        failed = [self.number(result) for result in runs if violations(self.limits, result)]
+        passed = [result for result in reversed(runs) if self.number(result) < min([*failed, *self.refused, inf])]
+        return max(passed, key=self.number, default=self.results[-1])
+
+    @property
+    def highest(self) -> int | None:
+        """The highest number that meets the limits, at least if the search was interrupted; None if there is none."""
+        is_met = not (self.result.interrupted or violations(self.limits, self.result))
+        return self.number(self.result) if self.find and is_met else None
 
     @property
     def sustained(self) -> bool | None:
@@ -181,24 +204,24 @@ def run_load_test(
     plan: Plan,
     limits: list[Limit],
     *,
-    find: bool = False,
+    find: str | None = None,
     report: Report = lambda *_: None,
     done: Callable[[Result], None] = lambda _: None,
 ) -> LoadTest:
     """Run a load test. After Ctrl-C, the measurements so far are returned.
 
-    find : search for the highest number of streams that meets the limits, beginning with the number in the plan
+    find : search for the highest number of this parameter that meets the limits, beginning with the one in the plan
     report, done : functions that are called with the progress, and after each run
     """
     load_test = LoadTest(limits, find)
 
-    def holds(streams: int) -> bool:
+    def holds(number: int) -> bool:
         try:
-            result = run(replace(plan, streams=streams), video, report)
+            result = run(_step(plan, find, number), video, report)
         except ServiceError as error:
-            if not find or not load_test.results:
+            if not load_test.results:
                 raise
-            load_test.refused[streams] = str(error)
+            load_test.refused[number] = str(error)
             return False
         load_test.results.append(result)
         done(result)
@@ -207,9 +230,10 @@ def run_load_test(
         return not violations(limits, result)
 
     try:
-        video = prepare(plan, plan.frames, report)
+        video = prepare(plan, max(plan.frames, _SEARCH_FRAMES) if find == "rate" else plan.frames, report)
         if find:
-            load_test.highest = find_highest(plan.streams, holds, MOST_STREAMS)
+            start = round(getattr(plan, find)) or _FIRST_SUBSCRIBERS
+            find_highest(max(1, start), holds, SEARCHES[find])
         else:
             holds(plan.streams)
     except KeyboardInterrupt:
@@ -217,21 +241,39 @@ def run_load_test(
     return load_test
 
 
+def _step(plan: Plan, find: str | None, number: int) -> Plan:
+    """The plan of a step of a search."""
+    match find:
+        case "streams":
+            return replace(plan, streams=number)
+        case "rate":
+            return replace(plan, rate=float(number))
+        case "subscribers":
+            return replace(plan, subscribers=number, slow_subscribers=min(number, plan.slow_subscribers))
+    return plan
+
+
 def find_highest(start: int, holds: Callable[[int], bool], most: int) -> int | None:
-    """Return the highest number from 1 to `most` for which `holds` is true; None if it is false even for 1.
+    """Return the highest number from 1 to `most` for which `holds` is true twice; None if it is not even for 1.
 
-    The number is doubled or halved from `start` until the limit is between two numbers, and then bisected. `holds` is
-    called once for each number, so random variation of its result affects the answer.
+    The number is doubled or halved from `start` until the limit is between two numbers, and then bisected, to within
+    5 %. `holds` is called again for the result; if it is false then, the search continues below.
 
-    >>> find_highest(1, lambda streams: streams <= 42, most=64)
-    42
+    >>> find_highest(1, lambda streams: streams <= 17, most=64)
+    17
     """
-    low, high, number = 0, most + 1, min(start, most)
-    doubling = True
-    while high - low > 1:
+    runs, high = {0: 2}, most + 1  # successful runs by number, all below the lowest number that has failed
+    number, is_doubled = min(start, most), True
+    while True:
         if holds(number):
-            low = number
+            runs[number] = runs.get(number, 0) + 1
         else:
-            high, doubling = number, False
-        number = min(2 * low, most) if doubling else (low + high) // 2
-    return low or None
+            high, is_doubled = number, False
+            runs = {each: count for each, count in runs.items() if each < high}
+        low = max(runs)
+        if high - low > max(1, low * _PRECISION):
+            number = min(2 * low, most) if is_doubled else (low + high) // 2
+        elif runs[low] < 2:
+            number = low
+        else:
+            return low or None

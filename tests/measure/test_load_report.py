@@ -15,14 +15,14 @@ PROVENANCE = provenance(["catstream", "loadtest", "--limit", "p99=0.1", "rtsp://
 
 def test_a_search_shows_the_number_of_streams_and_the_steps(result, tmp_path):
     runs = [result(*[[seconds] * 50] * streams) for streams, seconds in ((1, 0.01), (4, 0.3), (2, 0.02))]
-    load_test = LoadTest([Limit("p99", 0.1)], find=True, results=runs, highest=2)
+    load_test = LoadTest([Limit("p99", 0.1)], find="streams", results=runs)
     assert (load_test.result.plan.streams, load_test.sustained) == (2, True)
     page = write_report(tmp_path / "report.html", load_test, PROVENANCE).read_text()
     assert "Sustained: at most 2 streams" in page
     assert (page.count(">met<"), page.count(">exceeded<")) == (2, 1)
     steps = to_json(load_test, {})["steps"]
     assert [(step["streams"], step["p99"]) for step in steps] == [(1, 0.01), (4, 0.3), (2, 0.02)]
-    load_test = LoadTest([Limit("p99", 0.1)], find=True, results=runs[1:2])
+    load_test = LoadTest([Limit("p99", 0.1)], find="streams", results=runs[1:2])
     assert "Not sustained: 4 streams" in write_report(tmp_path / "report.html", load_test, PROVENANCE).read_text()
 
 
@@ -38,8 +38,8 @@ def test_verdict_is_the_first_line_of_the_report_and_in_json(result, tmp_path):
 
 def test_interrupted_search_says_at_least(result):
     runs = [result([0.01] * 50), result(*[[0.01] * 50] * 2, interrupted=True)]
-    load_test = LoadTest([Limit("p99", 0.1)], find=True, results=runs, interrupted=True)
-    assert verdict(load_test).startswith("Interrupted: at least 1 stream of")
+    load_test = LoadTest([Limit("p99", 0.1)], find="streams", results=runs, interrupted=True)
+    assert verdict(load_test).startswith("Interrupted: at least 1 stream: ")
     load_test.results.pop(0)
     assert verdict(load_test).startswith("Interrupted after 10.0 s: no verdict")
 
