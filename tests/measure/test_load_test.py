@@ -1,6 +1,5 @@
 """Limits and plans, and real runs: pipelines on a camera that does not wait, also if they are ended early."""
 
-import numpy as np
 import threading
 from contextlib import ExitStack, nullcontext
 
