@@ -139,7 +139,17 @@ def wrong_names(path: Path) -> Iterator[str]:
             yield from () if node.attr in catstream.__all__ else (f"uses catstream.{node.attr}",)
 
 
-@pytest.mark.parametrize("rule", [wrong_links, wrong_commands, wrong_names], ids=["links", "commands", "names"])
+def wrong_files(path: Path) -> Iterator[str]:
+    """Files that do not exist; a path begins at the root or in `catstream`. Scripts that were removed have a table."""
+    for name in re.findall(r"`([a-z_]+/[a-z_/]+\.(?:py|toml|service))`", prose(path).partition("## Measured once")[0]):
+        if not any((root / name).is_file() for root in (ROOT, ROOT / "catstream", ROOT / "benchmarks")):
+            yield f"names {name}, but there is no such file"
+
+
+RULES = {"links": wrong_links, "commands": wrong_commands, "names": wrong_names, "files": wrong_files}
+
+
+@pytest.mark.parametrize("rule", RULES.values(), ids=RULES)
 def test_what_the_pages_name_exists(rule):
     wrong = [f"{path.relative_to(ROOT)} {each}" for path in PAGES for each in rule(path)]
     assert not wrong, "\n".join(wrong)
