@@ -229,7 +229,7 @@ def until():
     """Wait until a condition holds, turn after turn, and return what it returned; fail where it never does."""
 
     def wait(condition, turn=lambda: time.sleep(0.01)):
-        deadline = time.monotonic() + 120
+        deadline = time.monotonic() + 300
         while not (found := condition()):
             assert time.monotonic() < deadline, "it did not happen in time"
             turn()

@@ -69,8 +69,8 @@ def test_a_fleet_that_does_not_answer_is_not_ready_and_has_no_metrics_of_streams
     monkeypatch.setattr(wall, "REGISTRY_SECONDS", 1.0)
     fleet.stream("cam-7")
     page = serve_fleet()
-    assert page.get("/readyz").status_code == 200
-    assert 'stream="cam-7"' in page.get("/metrics").text
+    until(lambda: page.get("/readyz").status_code == 200)
+    until(lambda: 'stream="cam-7"' in page.get("/metrics").text)
     manager.close()
     until(lambda: page.get("/readyz").status_code == 503)
     assert page.get("/healthz").status_code == 200

@@ -33,7 +33,8 @@ def test_objects_are_drawn_forgotten_and_tracked_until_they_leave_after_a_restar
             boxes.append(box)
     # The pipeline continues only if its tracks are received.
     settings = Settings(run={"endpoint": str(folder), "unstored_frames": 4})
-    server = Server(Site(PipelineFeed(Address(str(folder)))), port=0, token="correct-horse-battery")
+    feed = PipelineFeed(Address(str(folder)))
+    server = Server(Site(feed), port=0, token="correct-horse-battery")
     words = script_of_browser("page.mjs", server.url, ",".join(map(str, boxes[0])), str(SIZE[0]))
     output = tmp_path / "output"
 
@@ -63,10 +64,11 @@ def test_objects_are_drawn_forgotten_and_tracked_until_they_leave_after_a_restar
         with Pipeline(str(path), boxes[0], settings) as pipeline:
             browser.stdin.write("restart\n")
             browser.stdin.flush()
+            until(lambda: feed.dashboard.phase == "running")
             for _ in pipeline:
                 if said("errors []"):
                     break
-                sleep(0.1)  # the page connects while the run goes on, and shows the next frames
+                sleep(0.5)  # the page shows the next frames
     lines = output.read_text().splitlines()
     assert lines[0] == "state waiting for a box"
     assert "refused 'no name' is not a name: expected" in "\n".join(lines)
