@@ -6,7 +6,8 @@ They are layered, each on those before it:
     places       folder, endpoint, tcp, keys, disk: where the sockets, files and keys of one test are
     peers        commanded, managing: a thread that answers as a detector, or as the registry of a fleet;
                  camera, walker: an HTTP server in this process
-    the command  said, succeed, fail: in this process; catstream, program: in a process of its own, killed afterwards
+    the command  said, succeed, fail: in this process; catstream, program: in a process of its own, killed afterwards;
+                 alive: whether a process runs
     time         until, turning: wait for a condition; no test passes or fails by the time that something takes
 
 Only `catstream`, `program` and a `catstream.Pipeline` in a test start processes. `own_places` and `one_core` apply to
@@ -35,6 +36,7 @@ from unittest import mock
 import cv2
 import hypothesis
 import numpy as np
+import psutil
 import pytest
 import scipy.linalg  # noqa: F401  brings a BLAS of its own, to be limited too
 
@@ -236,6 +238,19 @@ def until():
         return found
 
     return wait
+
+
+@pytest.fixture(scope="session")
+def alive():
+    """Whether a process runs; one that ended and was not asked for its exit code yet does not."""
+
+    def runs(pid):
+        try:
+            return psutil.Process(pid).status() != psutil.STATUS_ZOMBIE
+        except psutil.NoSuchProcess:
+            return False
+
+    return runs
 
 
 @pytest.fixture(scope="session")

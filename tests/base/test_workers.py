@@ -8,7 +8,6 @@ import sys
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 
-import psutil
 import pytest
 
 from catstream.base.workers import Workers, run_tasks, sigint_blocked
@@ -66,7 +65,7 @@ def test_workers_outlive_the_thread_that_started_them():
         assert [*workers.run(os.getpid, [()])] == first
 
 
-def test_workers_end_with_a_process_that_is_killed():
+def test_workers_end_with_a_process_that_is_killed(alive, until):
     code = (
         "import os; from catstream.base.workers import Workers\n"
         "if __name__ == '__main__':\n"
@@ -74,4 +73,4 @@ def test_workers_end_with_a_process_that_is_killed():
     )
     killed = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     worker = int(killed.stdout)
-    assert not psutil.pid_exists(worker) or not psutil.wait_procs([psutil.Process(worker)], timeout=150)[1]
+    until(lambda: not alive(worker))

@@ -63,13 +63,6 @@ def listening(process):
     return set()
 
 
-def has_ended(process):
-    """Whether a process has ended; an orphan remains a zombie if the first process of a container does not reap it."""
-    with suppress(psutil.NoSuchProcess):
-        return process.status() == psutil.STATUS_ZOMBIE
-    return True
-
-
 # On this machine alone, in processes of their own: a process uses one cluster.
 
 
@@ -87,6 +80,7 @@ def local(file, until, *options):
     with subprocess.Popen(words, **both, text=True, start_new_session=True) as up:
         try:
             until(lambda: up.poll() is not None or name in fleets())
+            assert up.poll() is None, up.communicate()[1]
             with Registry(name, timeout=150) as registry:
                 until(lambda: [each.state for each in registry.streams().streams.values()] == ["running"])
             yield up
@@ -96,7 +90,7 @@ def local(file, until, *options):
 
 
 @pytest.mark.usefixtures("home")
-def test_a_local_fleet_is_closed_to_other_machines_and_users_until_ctrl_c(file, home, until):
+def test_a_local_fleet_is_closed_to_other_machines_and_users_until_ctrl_c(file, home, alive, until):
     with local(file, until) as up:
         processes = psutil.Process(up.pid).children(recursive=True)
         found = set().union(*map(listening, processes))
@@ -115,36 +109,36 @@ def test_a_local_fleet_is_closed_to_other_machines_and_users_until_ctrl_c(file, 
         started = [each for each in processes if "StreamActor" in each.name()]
         assert [each.nice() for each in started] == [os.getpriority(os.PRIO_PROCESS, 0)]
         os.killpg(up.pid, signal.SIGINT)  # as a terminal does
-        check_ended(up, processes, home)
+        check_ended(up, processes, home, alive, until)
 
 
-def check_ended(up, processes, home):
+def check_ended(up, processes, home, alive, until):
     """Check that a local fleet ends in order: its streams have stored their states, and no process is left."""
     assert up.communicate(timeout=120)[0].splitlines()[-1] == "the fleet local is down"
     assert up.returncode == 0
-    assert psutil.wait_procs(processes, timeout=60)[1] == []
+    until(lambda: not any(alive(each.pid) for each in processes))
     assert not module._is_up(home / "local")
     assert Store(str(home / "local" / "store")).stream("gate").newest().facts["frame"] > 0
 
 
 @pytest.mark.usefixtures("home")
-def test_sigterm_ends_a_local_fleet_as_ctrl_c_does(file, home, until):
+def test_sigterm_ends_a_local_fleet_as_ctrl_c_does(file, home, alive, until):
     with local(file, until) as up:
         processes = psutil.Process(up.pid).children(recursive=True)
         up.terminate()  # as systemd does; Ray has a handler of its own
-        check_ended(up, processes, home)
+        check_ended(up, processes, home, alive, until)
 
 
 @pytest.mark.usefixtures("home")
 @pytest.mark.parametrize("victim", ["raylet", "gcs_server"])
-def test_a_local_fleet_ends_with_its_streams_and_keeps_its_logs_if_ray_dies(file, home, until, victim):
+def test_a_local_fleet_ends_with_its_streams_and_keeps_its_logs_if_ray_dies(file, home, alive, until, victim):
     with local(file, until) as up:
         processes = psutil.Process(up.pid).children(recursive=True)
         next(each for each in processes if each.name() == victim).kill()
         said = up.communicate(timeout=120)[1]
         assert up.returncode == 1
         assert f"the fleet local has ended, because Ray's {victim} has died (exit status -9): start it again" in said
-        until(lambda: all(map(has_ended, processes)))  # no orphan writes beside the next start
+        until(lambda: not any(alive(each.pid) for each in processes))  # no orphan writes beside the next start
         assert (home / "local" / "logs" / f"{victim}.out").exists()
 
 

@@ -106,7 +106,7 @@ def test_a_file_that_cannot_be_written_is_an_error_before_the_work(tmp_path, wal
     assert why in fail("evaluate", walk, option, tmp_path / name)
 
 
-def test_ctrl_c_while_the_workers_start_is_one_line_and_no_worker_is_left(walk, catstream, until, tmp_path):
+def test_ctrl_c_while_the_workers_start_is_one_line_and_no_worker_is_left(walk, catstream, alive, until, tmp_path):
     """The terminal sends it to all of them, of which the workers are at their imports."""
     for name in ("a", "b"):
         shutil.copytree(walk, tmp_path / name)
@@ -120,4 +120,4 @@ def test_ctrl_c_while_the_workers_start_is_one_line_and_no_worker_is_left(walk, 
     assert errors.splitlines()[-1] == "stopped"
     assert "Traceback" not in errors
     assert process.returncode == 130
-    assert not psutil.wait_procs(children, timeout=150)[1]
+    until(lambda: not any(alive(child.pid) for child in children))

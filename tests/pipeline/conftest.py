@@ -6,7 +6,6 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
-import psutil
 import pytest
 
 FRAMES = 32
@@ -31,19 +30,6 @@ def long_video(demo_video):
     """The same with more frames, for events that take longer."""
     path, boxes = demo_video(60)
     return str(path), boxes
-
-
-@pytest.fixture
-def alive():
-    """Whether a process runs; one that ended and was not asked for its exit code yet does not."""
-
-    def runs(pid):
-        try:
-            return psutil.Process(pid).status() != psutil.STATUS_ZOMBIE
-        except psutil.NoSuchProcess:
-            return False
-
-    return runs
 
 
 @pytest.fixture

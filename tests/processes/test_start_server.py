@@ -60,12 +60,6 @@ def opened(pid):
     return places
 
 
-def has_ended(process):
-    with suppress(psutil.NoSuchProcess):
-        return process.status() == psutil.STATUS_ZOMBIE
-    return True
-
-
 def test_process_is_forked_in_the_folder_of_its_program_without_files_of_the_server(start, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     started, _, log = start()
@@ -91,13 +85,13 @@ def test_how_a_process_has_ended_is_known(start, until, number, code):
 
 
 @pytest.mark.usefixtures("own_server")
-def test_the_processes_end_with_their_start_server_and_a_new_one_starts_the_next(start, until):
+def test_the_processes_end_with_their_start_server_and_a_new_one_starts_the_next(start, alive, until):
     process, *_ = start()
-    running, server = psutil.Process(process.pid), start_server()
+    running, server = process.pid, start_server()
     os.kill(server.pid, signal.SIGKILL)
     assert until(process.poll) == -signal.SIGKILL
     assert process.lost
-    until(lambda: has_ended(running))
+    until(lambda: not alive(running))
     again, *_ = start()
     assert psutil.Process(again.pid).ppid() == start_server().pid != server.pid
 
