@@ -13,7 +13,6 @@ from typing import Any
 import click
 import msgspec
 import numpy as np
-from rich.console import Console
 
 from catstream.base.box import Box
 from catstream.base.files import check_file
@@ -74,6 +73,8 @@ with_wait = click.option(
 
 def wait_for_pipeline(address: Address, seconds: float) -> None:
     """Wait until a process of the pipeline answers; a terminal shows a status line."""
+    from rich.console import Console
+
     with Console(stderr=True).status(f"waiting for a pipeline at {address}"):
         wait_until_running(address, seconds)
 

@@ -12,15 +12,17 @@ import sys
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import click
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, TextColumn, TimeRemainingColumn
-from rich.table import Column, Table
 
 from catstream.base.addresses import without_passwords
 from catstream.errors import ServiceError
+
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.progress import Progress, ProgressColumn, TextColumn
+    from rich.table import Table
 
 _SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
 _WIDTH = 140  # columns of a table that is not printed to a terminal
@@ -28,11 +30,15 @@ _WIDTH = 140  # columns of a table that is not printed to a terminal
 
 def screen() -> Console:
     """The standard output, for tables."""
+    from rich.console import Console
+
     return Console(width=None if sys.stdout.isatty() else _WIDTH, markup=False, emoji=False)
 
 
 def messages() -> Console:
     """The standard error, for the progress, and lines of text above it."""
+    from rich.console import Console
+
     return Console(stderr=True, soft_wrap=True, highlight=False, markup=False, emoji=False)
 
 
@@ -43,6 +49,8 @@ def complain(problem: object) -> None:
 
 def table(*heads: str, right: Collection[str] = ()) -> Table:
     """A table without lines, whose columns `right` are aligned to the right."""
+    from rich.table import Table
+
     columns = Table(box=None, header_style="bold", pad_edge=False)
     for head in heads:
         columns.add_column(head, justify="right" if head in right else "left", overflow="fold")
@@ -54,6 +62,8 @@ def line_of(console: Console, *columns: ProgressColumn) -> Progress:
 
     columns : by default the description, a bar, how much of the total is done, and the time that remains
     """
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn
+
     parts = columns or (text("{task.description}"), BarColumn(24), MofNCompleteColumn(), TimeRemainingColumn())
     hidden, wide = not console.is_terminal, parts[-1].get_table_column().ratio is not None
     return Progress(*parts, console=console, transient=True, expand=wide, refresh_per_second=8, disable=hidden)
@@ -61,6 +71,9 @@ def line_of(console: Console, *columns: ProgressColumn) -> Progress:
 
 def text(form: str, *, last: bool = False) -> TextColumn:
     """A column of a progress display; the last one gets the room that is left, and is cut in a narrow terminal."""
+    from rich.progress import TextColumn
+    from rich.table import Column
+
     return TextColumn(form, markup=False, table_column=Column(no_wrap=True, ratio=1 if last else None))
 
 

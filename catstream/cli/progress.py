@@ -6,16 +6,17 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-
-from rich.console import Console
-from rich.status import Status
-from rich.text import Text
+from typing import TYPE_CHECKING
 
 from catstream.base.names import UNNAMED
 from catstream.base.text import counted
 from catstream.pipeline import Pipeline
 from catstream.video.frames import describe_counters
 from catstream.wire.messages import Track
+
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.status import Status
 
 #: Seconds between two updates of the line on the terminal.
 REFRESH_SECONDS = 0.1
@@ -69,6 +70,8 @@ class RunProgress:
         """Update the line on a terminal, at most ten times a second."""
         if console.is_terminal and self._looked - self._refreshed >= REFRESH_SECONDS:
             self._refreshed = self._looked
+            from rich.text import Text
+
             status.update(Text(self.line(), no_wrap=True, overflow="ellipsis"))
 
     def line(self) -> str:

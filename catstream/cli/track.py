@@ -13,7 +13,6 @@ from shlex import quote
 from typing import TYPE_CHECKING
 
 import click
-from rich.console import Console
 
 from catstream.base.box import Box
 from catstream.base.names import UNNAMED
@@ -50,6 +49,8 @@ from catstream.processes.job import Results
 from catstream.processes.state import contains_run, files_of_state
 
 if TYPE_CHECKING:
+    from rich.console import Console
+
     from catstream.web.feed import PipelineFeed
     from catstream.web.server import Server
 

@@ -14,7 +14,6 @@ from time import monotonic
 from typing import Any, Generic, Self, TypeVar, cast
 
 import zmq
-import zmq.asyncio
 
 from catstream.base.clock import RunningClock
 from catstream.base.forks import check_not_forked, generation
@@ -192,6 +191,8 @@ class Subscription(Generic[Message]):
         return self
 
     async def __anext__(self) -> Message:
+        import zmq.asyncio  # a tenth of a second, with asyncio
+
         deadline = self._deadline()
         while (message := self._take(deadline)) is None:
             if self._is_over:
