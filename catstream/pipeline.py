@@ -16,25 +16,23 @@ from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
-from typing import Literal, Self
+from typing import TYPE_CHECKING, Literal, Self
 
 from catstream.base.addresses import without_password
-from catstream.base.files import check_distinct, check_file
 from catstream.base.forks import check_not_forked, forked, generation
-from catstream.base.names import Boxes
-from catstream.base.settings import Settings
 from catstream.errors import ServiceError, SettingsError
-from catstream.output.destinations import Header
-from catstream.processes.job import Job, Models, Results, files_by_name
-from catstream.processes.probe import probe
 from catstream.processes.start_server import start_server
-from catstream.processes.state import check_new, locked_for_run, position, saved
-from catstream.processes.supervisor import Supervisor
-from catstream.video.source import ALL_FRAMES, source_text
-from catstream.wire.discovery import private_folder, reserve_endpoint
-from catstream.wire.messages import RunState, Track, run_state
+
+if TYPE_CHECKING:  # the methods import them, so that the constructor starts the server first
+    from catstream.base.names import Boxes
+    from catstream.base.settings import Settings
+    from catstream.output.destinations import Header
+    from catstream.processes.job import Job, Models, Results
+    from catstream.processes.supervisor import Supervisor
+    from catstream.wire.messages import RunState, Track
 
 _ONCE = "a pipeline runs once, and this one has run: make another Pipeline to track the source again"
+_ALL_FRAMES = slice(None)
 _CLOSED = ExitStack()  # marks a pipeline that was closed
 
 
@@ -129,7 +127,7 @@ class Pipeline:
         settings: Settings | Mapping[str, object] | None = None,
         *,
         model: Models | None = None,
-        part: slice = ALL_FRAMES,
+        part: slice = _ALL_FRAMES,
         state: str | os.PathLike[str] | None = None,
         resume: str | os.PathLike[str] | None = None,
         after: int | None = None,
@@ -138,7 +136,12 @@ class Pipeline:
         save_model: Models | None = None,
     ) -> None:
         _check_exclusive(state, resume, box, model)
-        start_server()  # it imports while this process opens the source
+        start_server()  # it imports while this process imports and opens the source
+        from catstream.processes.job import Job, Results
+        from catstream.processes.probe import probe
+        from catstream.processes.state import check_new
+        from catstream.video.source import source_text
+
         text = None if source is None else source_text(source)
         self._earlier: Job | None = None
         self._state = None if state is None else Path(state).absolute()
@@ -169,6 +172,10 @@ class Pipeline:
     def __enter__(self) -> Self:
         if self._stack is not None:
             raise ServiceError(_ONCE)
+        from catstream.processes.state import locked_for_run, saved
+        from catstream.processes.supervisor import Supervisor
+        from catstream.wire.discovery import private_folder, reserve_endpoint
+
         with ExitStack() as stack:
             folder = stack.enter_context(private_folder())
             settings, source = self.settings, without_password(self.source)
@@ -192,6 +199,8 @@ class Pipeline:
         """
         passed = 0.0
         if self.live and self._earlier is not None and self._state is not None:
+            from catstream.processes.state import position
+
             passed = max(position(self._state)[1], self.first_time) + self.settings.run.checkpoint_seconds
         return replace(
             self._job,
@@ -281,6 +290,8 @@ class Pipeline:
     @property
     def header(self) -> Header:
         """The header of the log of the run."""
+        from catstream.output.destinations import Header
+
         stride = self.part.step or 1
         return Header(
             source=without_password(self.source),
@@ -361,6 +372,8 @@ class Pipeline:
 
         Empty if they are tracked, and before the detector has reported it.
         """
+        from catstream.wire.messages import run_state
+
         state, _ = run_state(self.health.get("detector", {}))
         return "" if state in ("running", "ended") else state
 
@@ -369,6 +382,8 @@ class Pipeline:
         """Number of the last frame before the run, which the caller or the checkpoint has."""
         if self._earlier is None or self._state is None:
             return 0
+        from catstream.processes.state import position
+
         # Frames of a live source cannot be read again: the checkpoint may be ahead of the tracks.
         if self.first_frame is not None and not self.live:
             return self.first_frame
@@ -391,6 +406,9 @@ def _writable(files: Models) -> dict[str, Path]:
 
     ServiceError if one cannot be written.
     """
+    from catstream.base.files import check_distinct, check_file
+    from catstream.processes.job import files_by_name
+
     paths = {name: file.absolute() for name, file in files_by_name(files).items()}
     check_distinct((f"the saved model of {name or 'the object'}", path) for name, path in paths.items())
     for path in paths.values():

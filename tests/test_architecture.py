@@ -121,7 +121,8 @@ def test_imports_follow_the_rule(rule):
         ("import catstream; catstream.Tracker()", {"asyncio", "filterpy", "sklearn", "av"}),
         ("import catstream.processes.compressor", {"asyncio", "cv2", "filterpy", "numba", "sklearn", "av"}),
         ("import catstream.processes.trainer", {"asyncio", "cv2", "filterpy", "numba", "sklearn", "av"}),
-        ("import catstream.cli.track", {"scipy", "numba", "filterpy", "sklearn", "av"}),
+        ("import catstream.cli, catstream.pipeline", {"asyncio", "msgspec", "numpy", "rich", "zmq"}),
+        ("import catstream.cli.track", {"asyncio", "filterpy", "rich", "scipy", "numba", "sklearn", "av"}),
     ],
 )
 def test_a_program_starts_without_slow_libraries_that_it_does_not_need(start, unused):

@@ -35,9 +35,7 @@ from pathlib import Path
 
 from catstream.base.forks import after_fork
 from catstream.base.threads import ONE_THREAD
-from catstream.base.workers import name_process
 from catstream.errors import ServiceError
-from catstream.processes.process import reset_process, run
 
 #: The processes that a server can start, in the order in which a pipeline starts and ends them.
 NAMES = ("detector", "compressor", "trainer")
@@ -228,9 +226,12 @@ def main(descriptor: int, program: int) -> None:
     if sys.stderr is None:  # the program has closed it
         os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
         sys.stderr = os.fdopen(2, "w")
+    gc.disable()  # imported modules are no garbage
+    from catstream.base.workers import name_process
+    from catstream.processes.process import reset_process
+
     reset_process()
     name_process("catstream:start")
-    gc.disable()  # imported modules are no garbage
     requests = socket.socket(fileno=descriptor)
     has_ended, wakes = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
     signal.set_wakeup_fd(wakes)
@@ -281,6 +282,8 @@ def _run(request: dict[str, str], parent: int, log: int, memory: int) -> None:
         with suppress(OSError):  # it was removed
             os.chdir(request["folder"])
         gc.enable()
+        from catstream.processes.process import run
+
         code = run(request["name"], Path(request["job"]), parent, memory, restarted=bool(request["restarted"]))
         atexit._run_exitfuncs()
     except SystemExit as end:
