@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -222,13 +223,19 @@ def _patch(
     patch = frame.cut(x, y, *pixel, _PATCH, turn)
     if offset is None:
         return patch
-    # The share of the object in each pixel: 1 inside its ellipse, falling to 0 around it.
-    position = (np.arange(_PATCH) - (_PATCH - 1) / 2) / (WINDOW * CELL / 2)
-    radius = np.hypot((position * (window.h / box.h))[:, None], position * (window.w / box.w))
-    share = ((_TRANSPARENT - radius) / (_TRANSPARENT - _OPAQUE)).clip(0, 1).astype(np.float32)
+    share = _share(window.h / box.h, window.w / box.w)
     background = frame.cut(x + offset[0], y + offset[1], *pixel, _PATCH, turn)
     channels = zip(patch, background, strict=True)
     return np.stack([cv2.blendLinear(*pair, share, 1 - share) for pair in channels])
+
+
+@lru_cache(maxsize=64)  # most copies of a frame have the same ratios
+def _share(down: float, across: float) -> np.ndarray:
+    """The share of the object in each pixel of a patch, by the ratios of window and box: 1 inside its ellipse."""
+    position = (np.arange(_PATCH) - (_PATCH - 1) / 2) / (WINDOW * CELL / 2)
+    radius = np.hypot((position * down)[:, None], position * across)
+    share: np.ndarray = ((_TRANSPARENT - radius) / (_TRANSPARENT - _OPAQUE)).clip(0, 1).astype(np.float32)
+    return share
 
 
 def _appearance(
