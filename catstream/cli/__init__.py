@@ -102,7 +102,7 @@ def main() -> None:
     INTERRUPTS.install()
     command = " ".join(sys.argv)
     if (shown := without_passwords(command)) != command:
-        from catstream.base.workers import name_process
+        from catstream.base.system import name_process
 
         name_process("catstream", shown)
     os.environ["PYTHONSAFEPATH"] = "1"  # no child of this process imports a file of the current folder

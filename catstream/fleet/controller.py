@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from catstream.base.addresses import is_live, without_password
-from catstream.base.workers import die_with
+from catstream.base.system import die_with
 from catstream.errors import CatstreamError
 from catstream.fleet.actor import Stream
 from catstream.fleet.registry import RegistryServer

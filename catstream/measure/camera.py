@@ -21,7 +21,8 @@ from typing import Any, Self
 import numpy as np
 
 from catstream.base.arrays import Float64
-from catstream.base.workers import SPAWN, die_with, sigint_blocked
+from catstream.base.system import die_with
+from catstream.base.workers import SPAWN, sigint_blocked
 from catstream.errors import ServiceError
 from catstream.measure.mjpeg import MjpegConnection
 from catstream.measure.rtsp import RtspConnection

@@ -12,7 +12,8 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 
 from catstream.base.arrays import Float64
-from catstream.base.workers import SPAWN, die_with, sharing, sigint_blocked
+from catstream.base.system import die_with
+from catstream.base.workers import SPAWN, sharing, sigint_blocked
 from catstream.client.address import Address
 from catstream.measure.camera import Schedule
 from catstream.measure.latency import Observations, Receipts, latencies

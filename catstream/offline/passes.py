@@ -17,8 +17,8 @@ from catstream.base.arrays import Float64
 from catstream.base.box import Box
 from catstream.base.names import UNNAMED
 from catstream.base.settings import Settings
+from catstream.base.system import release_memory
 from catstream.base.threads import one_thread
-from catstream.base.workers import release_memory
 from catstream.client.saved_model import SavedModel, merge
 from catstream.coreset.forest import Forest
 from catstream.detection.objects import Detectors

@@ -10,7 +10,7 @@ from typing import Any, Self
 
 from catstream.base.arrays import UInt8
 from catstream.base.box import Box
-from catstream.base.workers import release_memory
+from catstream.base.system import release_memory
 from catstream.errors import CatstreamError, CommandRejectedError, ObjectError, VideoError
 from catstream.offline.annotation import Annotation, NextFrame, Task
 from catstream.offline.keyframes import KeyframeBox

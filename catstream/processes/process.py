@@ -17,7 +17,7 @@ from pathlib import Path
 from secrets import token_hex
 
 from catstream.base.addresses import is_live, without_password
-from catstream.base.workers import die_with, name_process, release_memory
+from catstream.base.system import die_with, name_process, release_memory
 from catstream.errors import CatstreamError, StreamRewoundError
 from catstream.processes.ending import Ending
 from catstream.processes.job import Job

@@ -227,7 +227,7 @@ def main(descriptor: int, program: int) -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
         sys.stderr = os.fdopen(2, "w")
     gc.disable()  # imported modules are no garbage
-    from catstream.base.workers import name_process
+    from catstream.base.system import name_process
     from catstream.processes.process import reset_process
 
     reset_process()
