@@ -170,7 +170,7 @@ def _serve(
     context, results = click.get_current_context(), dict[int, _ResultFiles]()
 
     def start(number: int) -> Session:
-        annotation = Annotation(videos[number], {}, settings, jobs=2 * jobs)
+        annotation = Annotation(videos[number], {}, settings, jobs=jobs + 1)
         try:
             files = _ResultFiles(annotation, videos[number], folders[number])
             continues = files.keyframes.exists()

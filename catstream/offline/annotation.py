@@ -6,7 +6,7 @@ import os
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import Future
-from contextlib import closing
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -26,7 +26,7 @@ from catstream.errors import BoxError, ObjectError, VideoError
 from catstream.offline.fusion import fuse
 from catstream.offline.keyframes import HIDDEN, KeyframeBox, parse_box
 from catstream.offline.object_tracks import CHECKED, ObjectTracks
-from catstream.offline.passes import Pass, box_of, row_of, run_pass
+from catstream.offline.passes import PAUSED, Pass, box_of, row_of, run_pass
 from catstream.video.source import ALL_FRAMES
 from catstream.video.video_frames import VideoFrames
 from catstream.wire.messages import Check
@@ -243,6 +243,16 @@ class Annotation:
         os.close(file)
         work = task, self.frames, self.settings, Path(self._folder.name), Path(count)
         return self._workers.submit(_work, *work), Path(count)
+
+    @contextmanager
+    def paused(self) -> Iterator[None]:
+        """Pause the submitted passes inside a `with`, each after its present frame: the processor is free sooner."""
+        file = Path(self._folder.name, PAUSED)
+        file.touch()
+        try:
+            yield
+        finally:
+            file.unlink(missing_ok=True)  # several threads may pause them
 
     def store(self, future: Future[tuple[Task, Pass | None]]) -> None:
         """Store a pass that was submitted; it is used as long as the boxes that it began with are there.

@@ -7,6 +7,7 @@ with a memory: the merged coreset trees of all other boxes of the object.
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,6 +32,10 @@ from catstream.wire.messages import Track
 
 #: The boxes of an object at its keyframes, by number of the frame; None where it is absent.
 Keyframes = Mapping[int, Box | None]
+
+#: Name of a file in the folder of the models, see `run_pass`.
+PAUSED = "paused"
+_PAUSE_SECONDS = 0.01  #: between two looks for it
 
 _TRIMMED = 32  #: frames after which the memory of searches of whole frames is returned
 
@@ -117,7 +122,7 @@ def run_pass(
     searched for in the frames after it. Returns None if tracking cannot start: without a box, or with a box that looks
     like all around it.
 
-    models : folder for the models of the boxes
+    models : folder for the models of the boxes; while it has a file PAUSED, the pass waits
     count : file whose size is set to the number of frames so far; if it is deleted, the pass ends with an OSError
     """
     box, others = keyframes[start], {number: box for number, box in keyframes.items() if number != start}
@@ -127,15 +132,17 @@ def run_pass(
     step = 1 if stop > start else -1
     route = range(start, stop + step, step)
     try:
-        tracks = [*_tracks(_images(frames, route, count), box, learned, settings)][1:]
+        tracks = [*_tracks(_images(frames, route, models, count), box, learned, settings)][1:]
     except BoxError:
         return None
     boxes = np.stack([row_of(track.box) for track in tracks])
     return Pass(start, stop, boxes, np.array([track.score for track in tracks], np.float64), use_memory)
 
 
-def _images(frames: VideoFrames, numbers: Iterable[int], count: Path | None) -> Iterator[np.ndarray]:
+def _images(frames: VideoFrames, numbers: Iterable[int], models: Path, count: Path | None) -> Iterator[np.ndarray]:
     for done, number in enumerate(numbers, 1):
+        while (models / PAUSED).exists():
+            time.sleep(_PAUSE_SECONDS)
         if count is not None:
             os.truncate(count, done)
         if number % _TRIMMED == 0:

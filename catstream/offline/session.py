@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
@@ -16,7 +17,7 @@ from catstream.offline.annotation import Annotation, NextFrame, Task
 from catstream.offline.keyframes import KeyframeBox
 from catstream.offline.object_tracks import ObjectTracks
 
-#: Passes of more frames have processes of their own, so that a correction of a short stretch does not wait for them.
+#: Passes of more frames leave one process to shorter ones, so that a correction of a short stretch does not wait.
 _LONG = 600
 
 #: Expected errors of a stretch from which a box is asked for while others are tracked.
@@ -37,7 +38,7 @@ class Session:
     Parameters
     ----------
     annotation : Annotation whose frames are not numbered yet
-    jobs : number of passes that run at a time, and as many long ones beside them
+    jobs : number of long passes that run at a time, and of all passes less one
     save : function that is called after each change of the keyframes
     write : function that writes the results; called by `finish`
 
@@ -129,9 +130,11 @@ class Session:
             return object, frame
 
     def image(self, number: int) -> UInt8:
-        """Return the image of a frame. VideoError if it cannot be decoded: the damage is then looked for."""
+        """Return the image of a frame, before the passes go on. VideoError if it cannot be decoded: then, the damage
+        is searched for."""
         try:
-            return self.annotation.frames[number]
+            with self.annotation.paused():
+                return self.annotation.frames[number]
         except VideoError:
             with self.lock:
                 self._is_damaged = not self.annotation.frames.is_exact
@@ -237,11 +240,11 @@ class Session:
         count.unlink()  # ends it
 
     def _next_task(self) -> Task | None:
-        """The missing pass that starts next: the shortest beside the newest box of the object whose turn it is."""
+        """The missing pass that starts next: the shortest at the newest box of the object whose turn it is."""
         running = [task for task, _ in self._running.values()]
-        full = [long for long in (False, True) if sum(_is_long(task) == long for task in running) >= self._jobs]
-        waiting = (task for task in self._missing if task not in running and _is_long(task) not in full)
-        return min(waiting, key=self._priority, default=None)
+        limit = _LONG if sum(task.frames > _LONG for task in running) >= self._jobs else sys.maxsize
+        waiting = [task for task in self._missing if task not in running and task.frames <= limit]
+        return min(waiting, key=self._priority) if waiting and len(running) <= self._jobs else None
 
     def _priority(self, task: Task) -> tuple[int, bool, int]:
         is_newest = self._newest.get(task.object) in (task.start, task.stop)
@@ -253,7 +256,7 @@ class Session:
         return frame not in ends and any(
             task.object == following.object and min(task.start, task.stop) <= frame <= max(task.start, task.stop)
             for task in self._missing
-            if not (task.use_memory and _is_long(task))  # a person need not wait for it to add a box
+            if not (task.use_memory and task.frames > _LONG)  # a person need not wait for it to add a box
         )
 
 
@@ -316,7 +319,3 @@ class Sessions:
                 session.revision += before.revision + 1  # it never decreases for the page
                 self._sessions[number] = session.__enter__()
                 self.number = number
-
-
-def _is_long(task: Task) -> bool:
-    return task.frames > _LONG

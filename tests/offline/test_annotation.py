@@ -2,12 +2,14 @@
 
 import multiprocessing
 import shutil
+from pathlib import Path
 
 import pytest
 
 from catstream.base.box import Box
 from catstream.errors import BoxError, ObjectError, VideoError
 from catstream.offline import annotation as module
+from catstream.offline import passes
 from catstream.offline.annotation import Annotation, annotate
 
 FRAMES = 24
@@ -157,3 +159,13 @@ def test_boxes_that_cannot_be_tracked_are_an_error(demo, boxes, error, message):
 def test_a_live_source_is_an_error():
     with pytest.raises(VideoError, match="a live source"):
         annotate("rtsp://10.0.0.7/stream", {0: Box(1, 2, 30, 40)})
+
+
+def test_a_pass_waits_while_it_is_paused(demo, monkeypatch):
+    waits = []
+    with Annotation(demo[0], {}) as annotation:
+        folder = Path(annotation._folder.name)
+        with annotation.paused():
+            monkeypatch.setattr(passes.time, "sleep", lambda _: waits.append((folder / passes.PAUSED).unlink()))
+            images = [*passes._images(annotation.frames, [0], folder, None)]
+        assert (len(images), len(waits)) == (1, 1)

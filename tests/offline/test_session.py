@@ -1,6 +1,8 @@
 """A session: what a person changes is saved at once, tracked in the background, and undone."""
 
 import shutil
+from concurrent.futures import Future
+from pathlib import Path
 
 import pytest
 
@@ -8,7 +10,9 @@ from catstream.base.box import Box
 from catstream.errors import BoxError, CommandRejectedError, ObjectError, ServiceError, VideoError
 from catstream.offline import session as module
 from catstream.offline.annotation import Annotation
+from catstream.offline.passes import PAUSED
 from catstream.offline.session import Session
+from catstream.video.video_frames import VideoFrames
 
 FRAMES = 24
 
@@ -169,6 +173,33 @@ def test_the_frames_before_one_that_cannot_be_decoded_are_annotated(walk, until,
         assert str(session.problem).startswith("5 frames could be read: ")
         assert "0006.png" in str(session.problem)
         until(lambda: len(session.tracks.get("anna", [])) == 5)
+
+
+def test_passes_are_paused_while_an_image_is_decoded(session, until, monkeypatch):
+    until(lambda: session.decoded)
+    file = Path(session.annotation._folder.name, PAUSED)
+    monkeypatch.setattr(VideoFrames, "__getitem__", lambda *_: file.exists())
+    assert session.image(3) is True
+    assert not file.exists()
+
+
+def test_one_pass_more_than_long_ones_runs_at_a_time(demo, until, monkeypatch, tmp_path):
+    monkeypatch.setattr(module, "_LONG", 10)
+    submitted = []
+
+    def submit(task):
+        (count := tmp_path / str(len(submitted))).touch()
+        submitted.append((task.object, task.frames))
+        return Future(), count
+
+    drawn = {name: {0: demo[1][0]._replace(x=10 + step)} for step, name in enumerate(("anna", "ben", "carl"))}
+    drawn["carl"][3] = demo[1][3]
+    with Annotation(demo[0], drawn) as annotation:
+        monkeypatch.setattr(annotation, "submit", submit)
+        with Session(annotation, 2, lambda: None, lambda: None) as session:
+            until(lambda: len(submitted) >= 3)
+            with session.lock:
+                assert submitted == [("carl", 3), ("anna", FRAMES - 1), ("ben", FRAMES - 1)]
 
 
 def test_a_session_that_ends_while_it_reads_is_not_decoded(demo):
