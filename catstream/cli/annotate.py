@@ -87,6 +87,7 @@ def annotate(
                              batch reads it as well
       next.csv               frames to look at, those with most expected errors
                              first: frame,object,errors
+      passes.safetensors     finished passes, which the same command continues
 
     \b
     EXAMPLES
@@ -257,6 +258,7 @@ class _ResultFiles:
     def __init__(self, annotation: Annotation, video: str, folder: Path) -> None:
         self._annotation, self._video, self.folder = annotation, video, folder
         self.keyframes, self._next = folder / "keyframes.csv", folder / "next.csv"
+        annotation.stored = folder / "passes.safetensors"
 
     def check(self, *, overwrite: bool) -> None:
         """Raise VideoError if a file could not be written, or is there and should not be overwritten."""
@@ -276,7 +278,7 @@ class _ResultFiles:
         write_keyframes(self.keyframes, self._annotation.keyframes, self._video)
 
     def write(self) -> None:
-        """Write the log, and the table of the frames to look at next."""
+        """Write the log, the table of the frames to look at next, and the finished passes."""
         from catstream.output.destinations import TrackedFrame
 
         with self._log().opened("") as files:
@@ -284,6 +286,7 @@ class _ResultFiles:
                 files.write(TrackedFrame(list(tracks)))
         rows = ((frame, name, f"{errors:.1f}") for frame, name, errors in self._annotation.next_frames())
         write_table(self._next, ("frame", "object", "errors"), rows, VideoError)
+        self._annotation.save_passes()
 
     def _log(self) -> RunFiles:
         from catstream.output.destinations import Header, Origin

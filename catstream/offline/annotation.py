@@ -6,29 +6,33 @@ import os
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import Future
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass, field
+from importlib.metadata import version
 from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple, Self, cast
 
+import msgspec
 import numpy as np
 
 from catstream.base.addresses import is_live, without_password
 from catstream.base.arrays import Float64
 from catstream.base.box import Box
+from catstream.base.files import writing
 from catstream.base.names import UNNAMED, check_count, check_name, errors_about
 from catstream.base.settings import Settings
 from catstream.base.text import listed
 from catstream.base.threads import cores
 from catstream.base.workers import Workers
-from catstream.errors import BoxError, ObjectError, VideoError
+from catstream.errors import BoxError, ObjectError, ProtocolError, VideoError
 from catstream.offline.fusion import fuse
 from catstream.offline.keyframes import HIDDEN, KeyframeBox, parse_box
 from catstream.offline.object_tracks import CHECKED, ObjectTracks
 from catstream.offline.passes import PAUSED, Pass, box_of, row_of, run_pass
 from catstream.video.source import ALL_FRAMES
 from catstream.video.video_frames import VideoFrames
+from catstream.wire import storage
 from catstream.wire.messages import Check
 
 #: Called during the work with its name, the number of finished frames, and of all; None if that is unknown.
@@ -98,6 +102,7 @@ class Annotation:
     ----------
     frames : VideoFrames
     keyframes : dict of the boxes of each object, by name and frame
+    stored : file of finished passes, see `save_passes`; `scan` reads it. None without one
     counters : counters of the video by name, see `catstream.video.frames.describe_counters`
     progress : as of the parameters
 
@@ -122,7 +127,8 @@ class Annotation:
         progress: Progress = lambda *_: None,
     ) -> None:
         self.settings = Settings().replace(settings)
-        self._jobs, self.progress = jobs or cores(), progress
+        self._jobs, self.progress, self._part, self._video = jobs or cores(), progress, part, Path(video)
+        self.stored: Path | None = None
         if is_live(os.fspath(video)):
             redacted = without_password(os.fspath(video))
             raise VideoError(f"cannot annotate a live source ({redacted}): record it to a file first")
@@ -200,6 +206,7 @@ class Annotation:
             except BaseException as error:
                 self._is_scanned = isinstance(error, VideoError)  # if not, it was interrupted by `progress`
                 raise
+            self._load_passes()
         self._check(self.keyframes)
 
     def track(self) -> None:
@@ -260,6 +267,36 @@ class Annotation:
         VideoError if a frame could not be decoded.
         """
         self._insert(*self._workers.result(future))
+
+    def save_passes(self) -> None:
+        """Write the passes of the present boxes to the file `stored`; VideoError if it cannot be written."""
+        if self.stored is not None:
+            boxes = [drawn.items() for drawn in self._drawn.values()]
+            tasks = [task for task in self._passes if any(set(task.keyframes) <= drawn for drawn in boxes)]
+            tasks = [task for task in tasks if self._passes[task] is not None]
+            arrays = {
+                f"{name}{number}": getattr(self._passes[task], name)
+                for number, task in enumerate(tasks)
+                for name in ("boxes", "scores")
+            }
+            with writing(self.stored, VideoError):
+                facts = {"origin": self._origin(), "tasks": msgspec.to_builtins(tasks)}
+                storage.write(self.stored, arrays, facts, durable=False)
+
+    def _load_passes(self) -> None:
+        """Read the file `stored`. It is ignored if it is damaged, or of other frames, settings or another version."""
+        with suppress(OSError, ProtocolError):
+            arrays, facts = storage.read(self.stored or os.devnull)
+            tasks = msgspec.convert(facts["tasks"], list[Task]) if facts["origin"] == self._origin() else []
+            for number, task in enumerate(tasks):
+                rows = arrays[f"boxes{number}"], arrays[f"scores{number}"]
+                self._insert(task, Pass(task.start, task.stop, *rows, task.use_memory))
+
+    def _origin(self) -> list[object]:
+        """What the passes follow from, apart from the boxes."""
+        stats = [file.stat() for file in self.frames.images or [self._video] if file.exists()]  # it may be a pattern
+        files = [[stat.st_size, stat.st_mtime_ns] for stat in stats]
+        return [version("catstream"), self.settings.changed(), repr(self._part), len(self.frames), files]
 
     @property
     def tracks(self) -> dict[str, ObjectTracks]:

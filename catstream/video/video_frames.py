@@ -106,7 +106,7 @@ class VideoFrames:
 
     Attributes
     ----------
-    name, rate, size, counters : as of a `Source`
+    name, rate, size, images, counters : as of a `Source`
     settings : as of the parameters
     times : float64, seconds of the frames that are numbered so far; before `scan`, of the first one
     is_threaded : whether the decoder uses several threads, for a short latency; not in a pickled copy
@@ -120,8 +120,9 @@ class VideoFrames:
                 raise VideoError(f"{str(text)!r} is a live source: expected a video file, or a folder of images")
             first = next(source)
             self._source = source.reader if isinstance(source.reader, Images) else source.reader.path
-        self.name, self.rate, self.size, self.counters = source.name, source.rate, source.size, source.counters
-        self.times, self.is_exact, self.is_threaded = np.array([first.time]), False, False
+        self.name, self.rate, self.size, self.images = source.name, source.rate, source.size, source.images
+        self.times, self.counters = np.array([first.time]), source.counters
+        self.is_exact = self.is_threaded = False
         self._first: UInt8 = first.image
         self._index: _Index | None = None
         self._lock = threading.RLock()

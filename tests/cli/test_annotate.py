@@ -34,6 +34,7 @@ def test_annotate_writes_the_log_and_its_tables_and_continues_from_its_boxes(dem
     assert "all frames are checked" in output
     assert rows(out / "next.csv") == []
     assert len(rows(out / "keyframes.csv")) == 2
+    assert (out / "passes.safetensors").exists()
     log = rows(out / "demo.csv")
     assert [row["checked"] for row in log] == ["keyframe", *["checked"] * (FRAMES - 2), "keyframe"]
     assert all(0.97 <= float(row["probability"]) <= 1 for row in log)

@@ -161,6 +161,30 @@ def test_a_live_source_is_an_error():
         annotate("rtsp://10.0.0.7/stream", {0: Box(1, 2, 30, 40)})
 
 
+def test_stored_passes_are_used_for_the_same_video_and_settings(demo, both_ends, tmp_path):
+    video, truth = demo
+    both_ends.stored = tmp_path / "passes"
+    both_ends.save_passes()
+    boxes = {"ben": {0: truth[0], FRAMES - 1: truth[-1]}}
+
+    def missing(video=video, boxes=boxes, settings=None):
+        with Annotation(video, boxes, settings) as annotation:
+            annotation.stored = tmp_path / "passes"
+            annotation.scan()
+            return len(annotation.missing()), annotation.passes("ben")
+
+    count, stored = missing()
+    assert count == 0
+    for one, other in zip(stored, both_ends.passes("anna"), strict=True):
+        assert (one.start, one.stop) == (other.start, other.stop)
+        assert (one.boxes.tobytes(), one.scores.tobytes()) == (other.boxes.tobytes(), other.scores.tobytes())
+    assert missing(boxes={"ben": {0: truth[0], 12: truth[12], FRAMES - 1: truth[-1]}})[0] == 2
+    assert missing(settings={"coreset.size": 20})[0] == 2
+    assert missing(video=shutil.copy(video, tmp_path))[0] == 2  # it was written at another time
+    (tmp_path / "passes").write_bytes(b"damaged")
+    assert missing()[0] == 2
+
+
 def test_a_pass_waits_while_it_is_paused(demo, monkeypatch):
     waits = []
     with Annotation(demo[0], {}) as annotation:
