@@ -217,6 +217,8 @@ def _print_run(result: Result, limits: list[Limit]) -> None:
         click.echo(
             f"other processes kept {result.other_load:.1f} cores busy: repeat on an idle machine for reliable results"
         )
+    for error in result.errors:
+        click.echo(f"{click.style('failed', 'red')}: {error}")
     for limit in limits:
         met = click.style("met", "green") if limit.is_met(result) else click.style("not met", "red")
         click.echo(f"{met}: {limit.describe(result)}")

@@ -259,7 +259,7 @@ def write_report(path: Path, load_test: LoadTest, provenance: dict[str, object])
 
 def verdict(load_test: LoadTest) -> str:
     """State in one sentence whether the load was sustained, or the highest number that was, with its costs."""
-    result, reasons = load_test.result, "; ".join(violations(load_test.limits, load_test.result))
+    result = load_test.result
     if load_test.find and load_test.highest:
         is_least = load_test.interrupted or load_test.highest == SEARCHES[load_test.find]
         start = "Interrupted" if load_test.interrupted else "Sustained"
@@ -271,7 +271,9 @@ def verdict(load_test: LoadTest) -> str:
         return f"{start}: at {most} {number}: {result.plan}; a stream takes {cores:.2f} cores, {memory / 1e6:.0f} MB."
     if load_test.interrupted:
         return f"Interrupted after {result.seconds:.1f} s: no verdict on {result.plan}."
-    return f"Not sustained: {result.plan}: {reasons}." if reasons else f"Sustained: {result.plan}."
+    reasons = [limit.name for limit in load_test.limits if not limit.is_met(result)]
+    reasons += ["a stream failed"] * bool(result.errors)
+    return f"Not sustained ({', '.join(reasons)}): {result.plan}." if reasons else f"Sustained: {result.plan}."
 
 
 def _steps(load_test: LoadTest) -> Table:

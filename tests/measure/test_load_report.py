@@ -23,11 +23,11 @@ def test_a_search_shows_the_number_of_streams_and_the_steps(result, tmp_path):
     steps = to_json(load_test, {})["steps"]
     assert [(step["streams"], step["p99"]) for step in steps] == [(1, 0.01), (4, 0.3), (2, 0.02)]
     load_test = LoadTest([Limit("p99", 0.1)], find="streams", results=runs[1:2])
-    assert "Not sustained: 4 streams" in write_report(tmp_path / "report.html", load_test, PROVENANCE).read_text()
+    assert "Not sustained (p99): 4 streams" in write_report(tmp_path / "report.html", load_test, PROVENANCE).read_text()
 
 
 def test_verdict_is_the_first_line_of_the_report_and_in_json(result, tmp_path):
-    for tracked, told in ((1.0, "Sustained: 2 streams"), (0.8, "Not sustained: 2 streams")):
+    for tracked, told in ((1.0, "Sustained: 2 streams"), (0.8, "Not sustained (skipped): 2 streams")):
         run = result([0.01] * 50, [0.01] * 50, tracked=tracked)
         load_test = LoadTest(Limit.defaults(run.plan), results=[run])
         assert verdict(load_test).startswith(told)
