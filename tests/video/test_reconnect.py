@@ -8,49 +8,60 @@ import pytest
 
 from catstream.video.reconnect import Attempt, Kind, Loss, next_attempt
 
-#: A history of losses, as kinds with the number of frames, and the attempts that follow: how each begins, its demuxer.
+#: Losses, as kinds with the number of frames, and the attempts that follow: how each begins, and its mode.
 HTTP = {
     "a camera that restarts": (
         [("ended", 90), ("failed", 0), ("ended", 50)],
-        [("backoff", None), ("backoff", None), ("backoff", None)],
+        [("backoff", "parsed"), ("backoff", "parsed"), ("backoff", "parsed")],
     ),
-    "a still picture": ([("ended", 1), ("ended", 1)], [("poll", None), ("poll", None)]),
+    "a still picture": ([("ended", 1), ("ended", 1)], [("poll", "parsed"), ("poll", "parsed")]),
     "JPEGs that probing rejects": (
         [("invalid", 0), ("ended", 90), ("failed", 0)],
-        [("at once", "mjpeg"), ("backoff", "mjpeg"), ("backoff", "mjpeg")],
+        [("at once", "jpegs"), ("backoff", "jpegs"), ("backoff", "jpegs")],
     ),
     "JPEGs that probing waits for": (
         [("silent", 0), ("silent", 90), ("silent", 0)],
-        [("at once", "mjpeg"), ("backoff", "mjpeg"), ("backoff", "mjpeg")],
+        [("at once", "jpegs"), ("backoff", "jpegs"), ("backoff", "jpegs")],
     ),
-    "a page": ([("invalid", 0), ("invalid", 0), ("invalid", 0)], [("at once", "mjpeg"), ("backoff", None)] * 2),
-    "a text part between JPEGs": ([("invalid", 79)], [("at once", "mjpeg")]),
-    "a camera that is silent": ([("silent", 90), ("silent", 0)], [("backoff", None), ("backoff", None)]),
+    "a page": ([("invalid", 0), ("invalid", 0), ("invalid", 0)], [("at once", "jpegs"), ("backoff", "parsed")] * 2),
+    "a text part between JPEGs": ([("invalid", 79)], [("at once", "jpegs")]),
+    "a camera that is silent": ([("silent", 90), ("silent", 0)], [("backoff", "parsed"), ("backoff", "parsed")]),
     "another kind of camera": (
         [("invalid", 0), ("ended", 9), ("invalid", 0), ("ended", 9)],
-        [("at once", "mjpeg"), ("backoff", "mjpeg"), ("backoff", None), ("backoff", None)],
+        [("at once", "jpegs"), ("backoff", "jpegs"), ("backoff", "parsed"), ("backoff", "parsed")],
     ),
 }
+RTSP = {
+    "H.265": ([("invalid", 0), ("ended", 90)], [("at once", "parsed"), ("backoff", "parsed")]),
+    "a camera that is silent from the start": ([("silent", 0)] * 2, [("at once", "parsed"), ("backoff", "rtp")]),
+    "a camera that is silent": ([("silent", 90), ("silent", 0)], [("backoff", "rtp")] * 2),
+}
+MODES = {"http": ("parsed", "jpegs"), "rtsp": ("rtp", "parsed"), "rtmp": ("parsed",)}
 
 
-def attempts(losses, *, is_http=True):
+def attempts(losses, protocol="http"):
     """The attempts after each of the losses."""
-    attempt, result = Attempt(), []
+    modes, result = MODES[protocol], []
+    attempt = Attempt(modes[0])
     for kind, frames in losses:
-        attempt = next_attempt(attempt, Loss(kind, frames), is_http=is_http)
+        attempt = next_attempt(attempt, Loss(kind, frames), modes)
         result.append(attempt)
     return result
 
 
-@pytest.mark.parametrize(("losses", "expected"), HTTP.values(), ids=HTTP)
-def test_the_next_attempt_follows_from_the_history(losses, expected):
-    following = [(attempt.begin, attempt.demuxer) for attempt in attempts(losses)]
+@pytest.mark.parametrize(
+    ("protocol", "losses", "expected"),
+    [(protocol, *each) for protocol, table in (("http", HTTP), ("rtsp", RTSP)) for each in table.values()],
+    ids=[*HTTP, *(f"RTSP: {name}" for name in RTSP)],
+)
+def test_next_attempt_follows_from_the_losses(protocol, losses, expected):
+    following = [(attempt.begin, attempt.mode) for attempt in attempts(losses, protocol)]
     assert following == expected[: len(losses)]
 
 
 @pytest.mark.parametrize("losses", [losses for losses, _ in HTTP.values()], ids=HTTP)
-def test_only_http_is_polled_or_read_by_the_other_demuxer(losses):
-    assert {(attempt.begin, attempt.demuxer) for attempt in attempts(losses, is_http=False)} == {("backoff", None)}
+def test_only_http_is_polled_or_read_as_jpegs(losses):
+    assert {(attempt.begin, attempt.mode) for attempt in attempts(losses, "rtmp")} == {("backoff", "parsed")}
 
 
 def test_the_backoff_doubles_up_to_a_limit_until_a_frame_arrives():
