@@ -140,70 +140,85 @@ class Detectors:
             detector.adopt(model)
 
 
+class Claim:
+    """A detection as the claim of its object to a position in the frame."""
+
+    def __init__(self, name: str, detection: Detection, state: DetectorState) -> None:
+        self.name = name
+        self.detection = detection
+        self.state = state
+        self.box = detection.window.box()
+        # Most likely, such an object is absent or occluded, and a part of another object resembles it.
+        self.is_uncertain = state.level != "confident" or detection.redetected
+        # False also for an object whose position an uncertain one claims with a clearly higher score.
+        self.is_certain = not self.is_uncertain
+
+    def excludes(self, other: Claim) -> bool:
+        """Return True if another object may not be at the same position: they are not `together`."""
+        one, two = self.state, other.state
+        are_together = one.together.get(other.name) == two.first_frame or two.together.get(self.name) == one.first_frame
+        return self is not other and not are_together
+
+    def conflicts(self, positions: Mapping[Claim, Box]) -> bool:
+        """Return True if it conflicts with a certain object, or, unless it is certain, with one of a higher score."""
+        return any(
+            (other.is_certain or (not self.is_certain and other.detection.score >= self.detection.score))
+            and self.excludes(other)
+            and _conflict(self.box, box, self.is_uncertain)
+            for other, box in positions.items()
+        )
+
+    def elsewhere(self, positions: Mapping[Claim, Box]) -> Detection:
+        """Return the best window near the detection outside the positions of others; its score is 0 without one."""
+        occupied = [box for other, box in positions.items() if self.excludes(other)]
+        if (around := self.detection.around) is not None:
+            for index in np.argsort(-around.scores, axis=None, kind="stable"):
+                row, column = map(int, np.unravel_index(index, around.scores.shape))
+                if (score := float(around.scores[row, column])) <= 0:
+                    break
+                window = around.window(row, column)
+                if not any(_conflict(window.box(), other, self.is_uncertain) for other in occupied):
+                    # Elsewhere in the frame, it is redetected there too: its object is not trusted.
+                    return replace(self.detection, score=score, window=window)
+        return replace(self.detection, score=0.0, redetected=False)
+
+
 def assign(detections: Mapping[str, Detection], states: Mapping[str, DetectorState]) -> dict[str, Detection]:
-    """Resolve conflicts: give a position to one object, to the one whose score would fall most without it.
+    """Resolve conflicts: assign each contested position to the object whose score would fall most without it.
 
     An object that loses its position gets the best other window near it; its score is 0 if there is none. Objects that
-    are `together` may be at the same position, and an object that is still sought occupies none. Without a conflict, a
-    detection is unchanged.
+    are `together` may be at the same position, and an object that is not yet detected occupies none. Without a
+    conflict, a detection is unchanged.
 
-    An object is uncertain if it was not "confident" in the last frame, or is redetected. Most likely it is absent or
-    occluded, and a part of another object resembles it. So it also loses a position of which more than a third is in
-    the box of a certain object, or of one with a higher score; and a certain object loses its position to an uncertain
-    one only if the score of that is clearly higher.
+    An object is uncertain if it was not "confident" in the last frame, or is redetected. It also loses a position of
+    which more than a third is in the box of a certain object, or of an object with a higher score. A certain object
+    loses its position to an uncertain one only if the score of the uncertain one is clearly higher.
     """
-    names = [name for name, state in states.items() if not state.is_sought]
-    boxes = {name: detections[name].window.box() for name in names}
-    scores = {name: detections[name].score for name in names}
-    uncertain = {name for name in names if states[name].level != "confident" or detections[name].redetected}
-    # Step 1: the others are certain, unless an uncertain object scores clearly higher at their position.
-    certain = {
-        name
-        for name in set(names) - uncertain
-        if not any(scores[name] < scores[other] - _LEAD and _conflict(boxes[name], boxes[other]) for other in uncertain)
-    }
-    # Step 2: an object gives way to the certain ones, and if it is not certain itself, to those that score higher.
-    exclusive = {
-        name: [other for other in names if other != name and not _are_together(states, name, other)] for name in names
-    }
-    rivals = {
-        name: [
-            other
-            for other in exclusive[name]
-            if other in certain or (name not in certain and scores[other] >= scores[name])
-        ]
-        for name in names
-    }
-
-    def in_conflict(name: str, positions: Mapping[str, Box]) -> bool:
-        occupied = [positions[other] for other in rivals[name] if other in positions]
-        return any(_conflict(boxes[name], box, name in uncertain) for box in occupied)
-
-    def elsewhere(name: str, positions: Mapping[str, Box]) -> Detection:
-        occupied = [positions[other] for other in exclusive[name] if other in positions]
-        return _best_elsewhere(detections[name], occupied, name in uncertain)
-
-    # Step 3: objects without a conflict keep their positions. Of the rest, the certain ones come first, then those
-    # that would lose most; each keeps its position if that is free, or gets the best one near it.
-    conflicts = [name for name in names if in_conflict(name, boxes)]
-    loss = {name: scores[name] - elsewhere(name, boxes).score for name in conflicts}
-    assigned = {name: box for name, box in boxes.items() if name not in conflicts}
+    claims = [Claim(name, detections[name], state) for name, state in states.items() if not state.is_sought]
+    # Step 1: an object is not certain if an uncertain one scores clearly higher at its position.
+    for claim in claims:
+        for other in claims:
+            if other.is_uncertain and claim.detection.score < other.detection.score - _LEAD:
+                claim.is_certain &= not _conflict(claim.box, other.box)
+    # Step 2: objects without a conflict keep their positions.
+    claimed = {claim: claim.box for claim in claims}
+    disputed = [claim for claim in claims if claim.conflicts(claimed)]
+    assigned = {claim: claim.box for claim in claims if claim not in disputed}
+    # Step 3: of the rest, the certain ones come first, then those that would lose most. Each keeps its position if it
+    # is free. Otherwise, it gets one that is neither assigned nor claimed by a later object.
+    disputed.sort(
+        key=lambda claim: (claim.is_certain, claim.detection.score - claim.elsewhere(claimed).score), reverse=True
+    )
     result = dict(detections)
-    for name in sorted(conflicts, key=lambda name: (name in certain, loss[name]), reverse=True):
-        taken = [assigned[other] for other in exclusive[name] if other in assigned]  # also by one with a lower score
-        if in_conflict(name, assigned) or any(_conflict(boxes[name], box) for box in taken):
-            # Neither at an assigned position, nor at one that a later object may be assigned.
-            result[name] = elsewhere(name, boxes | assigned)
-        if result[name].score > 0:
-            assigned[name] = result[name].window.box()
-        boxes.pop(name)
+    for claim in disputed:
+        # An object of a lower score that had more to lose may be there.
+        is_taken = any(claim.excludes(other) and _conflict(claim.box, box) for other, box in assigned.items())
+        if is_taken or claim.conflicts(assigned):
+            result[claim.name] = claim.elsewhere(claimed | assigned)
+        if result[claim.name].score > 0:
+            assigned[claim] = result[claim.name].window.box()
+        del claimed[claim]
     return result
-
-
-def _are_together(states: Mapping[str, DetectorState], name: str, other: str) -> bool:
-    """Return True if the boxes of two objects overlap since the first frame of one of them."""
-    first, second = states[name], states[other]
-    return first.together.get(other) == second.first_frame or second.together.get(name) == first.first_frame
 
 
 def _without_separated(state: DetectorState, states: Mapping[str, DetectorState]) -> DetectorState:
@@ -223,17 +238,3 @@ def _without_separated(state: DetectorState, states: Mapping[str, DetectorState]
 def _conflict(box: Box, other: Box, uncertain: bool = False) -> bool:
     """Return True if a box is at the position of another one, or, if its object is uncertain, at a part of it."""
     return box.overlap(other) > _SAME_POSITION or (uncertain and box.share_in(other) > _PART)
-
-
-def _best_elsewhere(detection: Detection, occupied: list[Box], uncertain: bool) -> Detection:
-    """The best window near a detection that is at none of the occupied positions."""
-    if (around := detection.around) is not None:
-        for index in np.argsort(-around.scores, axis=None, kind="stable"):
-            row, column = map(int, np.unravel_index(index, around.scores.shape))
-            if (score := float(around.scores[row, column])) <= 0:
-                break
-            window = around.window(row, column)
-            if not any(_conflict(window.box(), other, uncertain) for other in occupied):
-                # Elsewhere in the frame, it is redetected there too: its object is not trusted.
-                return replace(detection, score=score, window=window)
-    return replace(detection, score=0.0, redetected=False)
