@@ -6,7 +6,7 @@ A window is 8 x 8 cells. A search at another size resizes the frame, not the mod
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -57,23 +57,39 @@ class Detection:
 def find(context: FrameContext, state: DetectorState) -> Detection:
     """Search near the predicted window; also in the whole frame, if the belief is low.
 
-    The best window elsewhere replaces the best one nearby if its score is clearly higher.
+    The whole frame is searched at 0.8, 1 and 1.25 times the last confident size. If it has more than `_MAX_CELLS` cells
+    at the three sizes, each frame is searched in part; every second part is around the window, if the window is tiny.
     """
-    settings = context.settings
+    settings, frame, first = context.settings, context.pyramid, state.first_window
     last_confident = state.confident_window.centred(*state.window.centre)  # its size, at the predicted centre
     if settings.search.mode == "full":
         doubtful = not state.trusted or state.level == "lost"
-        best = full_search(context, last_confident if doubtful else state.window)
-        best = fit_extent(context, best, state.first_window)
+        window = last_confident if doubtful else state.window
+        best = _best_of(context, _whole_frame(context, window, _FULL_FACTORS), window)
+        best = fit_extent(context, best, first)
         return replace(best, redetected=not best.window.overlap(state.window))
-    nearby = _search_near(context, state.window, state.first_window)
+    # Step 1: search near the predicted window. The belief in the best window determines whether to search elsewhere.
+    nearby = fit_extent(context, local_search(context, state.window), first)
     level = belief.level_of(nearby.score, state.trusted, settings.belief)
     interval = belief.policies(settings.search.full_interval)[level].search_interval
-    other = _search_elsewhere(context, last_confident, interval) if interval else None
-    if other is not None and other.score > max(settings.belief.confident_score, nearby.score + _REDETECTION_MARGIN):
-        other = _search_near(context, other.window, state.first_window)
-        if other.score > nearby.score:
-            return replace(other, redetected=True)
+    if not interval:
+        return nearby
+    # Step 2: select the part of the whole frame that is due.
+    regions = tuple(region for _, region in _whole_frame(context, last_confident, _FULL_FACTORS))
+    around = _turns(last_confident.w, last_confident.h, regions)
+    everywhere = _turns(last_confident.w, last_confident.h, (frame.region,) * len(regions))
+    is_tiny = around != everywhere
+    number = due_part(context.seq, interval, len(everywhere) * (2 if is_tiny else 1))
+    if number is None:
+        return nearby
+    number, is_second = divmod(number, 2) if is_tiny else (number, True)
+    turns = everywhere if is_second else around
+    elsewhere = _best_of(context, turns[number % len(turns)], last_confident)
+    # Step 3: replace the best window nearby if the score elsewhere is clearly higher, and not lower once it is refined.
+    if elsewhere.score > max(settings.belief.confident_score, nearby.score + _REDETECTION_MARGIN):
+        elsewhere = fit_extent(context, local_search(context, elsewhere.window), first)
+        if elsewhere.score > nearby.score:
+            return replace(elsewhere, redetected=True)
     return nearby
 
 
@@ -127,13 +143,6 @@ def local_search(context: FrameContext, window: Window) -> Detection:
     return Detection(*scores.best(_DISTANCE_PENALTY * (distance[:, None] ** 2 + distance**2)), around=scores)
 
 
-def full_search(context: FrameContext, window: Window) -> Detection:
-    """Return the best window of a whole frame at three sizes: that of a window, 0.8 and 1.25 times as large."""
-    frame = context.pyramid
-    parts = [(factor, frame.region_around(window.scaled(factor))) for factor in _FULL_FACTORS]
-    return _best_of(context, parts, window)
-
-
 def due_part(seq: int, interval: int, count: int) -> int | None:
     """Return the number of the part of a task that is due in a frame; None if no part is.
 
@@ -146,24 +155,9 @@ def due_part(seq: int, interval: int, count: int) -> int | None:
     return number if number < count else None
 
 
-def _search_elsewhere(context: FrameContext, window: Window, interval: int) -> Detection | None:
-    """Return the best window of the parts of a frame that are due, at 0.8, 1 or 1.25 times its size; None if none is.
-
-    At most `_MAX_CELLS` cells are searched in a frame. If the frame has more at the three sizes, its parts take turns;
-    every second turn is around the window, if the window is tiny.
-    """
-    frame = context.pyramid
-    sizes = [window.scaled(factor) for factor in _FULL_FACTORS]
-    around = _turns(window.w, window.h, tuple(map(frame.region_around, sizes)))
-    everywhere = _turns(window.w, window.h, (frame.region,) * len(sizes))
-    if around == everywhere:
-        turn = due_part(context.seq, interval, len(around))
-        return None if turn is None else _best_of(context, around[turn], window)
-    turn = due_part(context.seq, interval, 2 * len(everywhere))
-    if turn is None:
-        return None
-    turns = everywhere if turn % 2 else around
-    return _best_of(context, turns[turn // 2 % len(turns)], window)
+def _whole_frame(context: FrameContext, window: Window, factors: Iterable[float]) -> list[_Part]:
+    """Return the regions of a whole frame around a window at several factors of its size."""
+    return [(factor, context.pyramid.region_around(window.scaled(factor))) for factor in factors]
 
 
 @lru_cache(maxsize=8)  # a 4K frame has thousands of parts for a tiny window
@@ -211,8 +205,7 @@ def _search_all_sizes(
     anything may score high: the rival, the best window that does not overlap this one, shows how high. The score of the
     background's mean is 0.
     """
-    frame = context.pyramid
-    parts = [(factor, frame.region_around(window.scaled(factor))) for factor in factors]
+    parts = _whole_frame(context, window, factors)
     scores, maps = _score_parts(context, parts, window)
     best = Detection(*scores.best())
     best_similarity = similarity(scores.cells.row(*scores.argmax()))
@@ -224,11 +217,6 @@ def _search_all_sizes(
         return best, False
     rival_similarity = similarity(rival_map.cells.row(*rival_map.argmax())) if rival_score else 0.0
     return best, lead >= _LEAD_OVER_SIMILAR or rival_similarity < best_similarity / 2
-
-
-def _search_near(context: FrameContext, window: Window, first: Window | None) -> Detection:
-    """Return the best window near another one, at its best size and aspect ratio."""
-    return fit_extent(context, local_search(context, window), first)
 
 
 def fit_extent(context: FrameContext, detection: Detection, first: Window | None) -> Detection:

@@ -97,24 +97,25 @@ class Start:
 
 
 def resume_at(position: Position, after: int | None, desired: DesiredState, *, live: bool) -> Start:
-    """Where a detector continues: after the last frame that both the compressor and the owner have.
+    """Return where a detector continues: after the last frame that both the compressor and the owner have.
 
-    Frames of a live source cannot be read again: the stream continues after the last frame that was learned from.
-
-    The SCM bootstrap of an object is not stored. If no object has a model yet, a file is tracked again from the first
-    frame of the first object. If one of several objects has no model yet, it restarts at its last known box; only the
-    SCM bootstrap takes that long. An object of a saved model without trees in the compressor begins again.
+    An object without a model begins again; only the SCM bootstrap, which is not stored, takes longer than a frame.
 
     Parameters
     ----------
     position : answer of the compressor, with the states after message `after`
     after : number of the last message that the owner of the run has, None without an owner
     """
+    # Step 1: the last message of both. Frames of a live source cannot be read again: it continues after the last one
+    # that was learned from.
     after = position.processed if live or after is None else after
     seq, repeats = min(after, position.processed), max(after, position.processed)
     earlier = {name: item for name, item in desired.objects.items() if item.begins <= seq}
+    # Step 2: if no object has a model yet, a file is tracked again from the first frame of the first object.
     if earlier and not live and not position.versions:
         return Start(min(item.begins for item in earlier.values()) - 1, repeats, desired, {})
+    # Step 3: objects with a model continue. The others begin again at their last known boxes, or are searched for with
+    # their saved models.
     states = {name: state for name, state in position.states.items() if name in earlier and name in position.versions}
     for name, item in earlier.items():
         if name not in states:
