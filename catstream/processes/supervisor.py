@@ -14,6 +14,7 @@ import threading
 from collections import deque
 from contextlib import ExitStack
 from dataclasses import replace
+from enum import IntEnum
 from pathlib import Path
 from secrets import token_hex
 from typing import BinaryIO
@@ -90,7 +91,7 @@ class Child:
     """
 
     def __init__(self, name: str, job: Path, folder: Path) -> None:
-        self.name, self._job = name, job
+        self.name, self.job = name, job
         self.due = self.silent = self._turns = 0.0
         self.restarts: deque[float] = deque()
         self.process: StartedProcess | None = None
@@ -111,7 +112,7 @@ class Child:
         self.silent, self.hung = 0.0, False
         self.log.begin()
         log, memory = self.log.fileno(), self.memory.handle
-        self.process = start_server().start(self.name, self._job, log, memory, restarted=bool(self.restarts))
+        self.process = start_server().start(self.name, self.job, log, memory, restarted=bool(self.restarts))
 
     def ending(self, code: int) -> str:
         """Describe how the process ended: the signal or the exit code.
@@ -155,6 +156,18 @@ def _status(code: int) -> str:
     return f"signal {signal.Signals(-code).name if -code in {*signal.Signals} else -code}"  # else real-time
 
 
+class Phase(IntEnum):
+    """The phases of a run, in their order; some may be left out.
+
+    OVER      no further frames are received: the detector has ended, or a process failed repeatedly
+    STOPPING  `stop` waits for the processes to end
+    HURRYING  `stop` was interrupted, and waits for no process
+    ENDED     all processes have ended
+    """
+
+    RUNNING, OVER, STOPPING, HURRYING, ENDED = range(5)
+
+
 class Supervisor:
     """The processes of one run, and the thread that receives its tracks, its health and its end.
 
@@ -162,23 +175,20 @@ class Supervisor:
 
     folder  of the file of the job, of the logs, and of the state if the job has no folder for it
     after   number of the last frame that the program has, which a run that is resumed follows
-    end     the last message of the run; None before it was received
-    health  the newest health report of each process, by its name
     """
 
     def __init__(self, job: Job, folder: Path, after: int = 0) -> None:
+        #: The last message of the run; None before it was received.
         self.end: End | None = None
+        #: The newest health report of each process, by its name.
         self.health: dict[str, Health] = {}
-        self._live, self._folder = is_live(job.source), folder
+        self._live = is_live(job.source)
+        self._changed = threading.Condition()  # guards the frames and the phase
         self._frames: deque[Tracks] = deque()  # that were received, and not returned yet
-        self._changed = threading.Condition()
-        self._over: bool = False  # whether no further frames are received
-        self._error: Exception | None = None
+        self._phase = Phase.RUNNING
+        self._error: Exception | None = None  # that ended the run
         self._clock = RunningClock()  # of the time without progress of a process
-        self._checked = self._clock()
-        self._ending = threading.Event()  # set by `stop`
-        self._hurries = threading.Event()  # set if `stop` is interrupted: no process is waited for
-        self._ended = threading.Event()  # set once all processes have ended
+        self._checked = self._clock()  # when the processes were checked last
         file = replace(job, state=job.state or folder, run=token_hex(8)).save(folder)
         endpoint = Endpoint.parse(job.endpoint, job.settings.run.keys)
         with starting(), ExitStack() as stack:
@@ -188,11 +198,10 @@ class Supervisor:
             for name in NAMES:
                 child = self._children[name] = Child(name, file, folder)
                 stack.callback(child.close)
-            for name in NAMES:
-                self._children[name].start(after)
-            self._stack = stack.pop_all()
-        self._thread = threading.Thread(target=self._run, name="catstream supervisor", daemon=True)
-        self._thread.start()
+            for child in self._children.values():
+                child.start(after)
+            resources = stack.pop_all()
+        threading.Thread(target=self._run, args=[resources], name="catstream supervisor", daemon=True).start()
 
     @property
     def pids(self) -> dict[str, int]:
@@ -212,17 +221,17 @@ class Supervisor:
         if the source failed.
         """
         with self._changed:
-            self._changed.wait_for(lambda: self._frames or self._over, None if seconds == math.inf else seconds)
-            if self._frames and not self._ending.is_set():
+            self._changed.wait_for(lambda: self._frames or self._phase, None if seconds == math.inf else seconds)
+            if self._frames and self._phase < Phase.STOPPING:
                 tracks = self._frames.popleft()
                 if self.end is None:
                     self._children["detector"].memory.owner.read = tracks.seq
                 return tracks.tracks
-            if not self._over:
+            if self._phase is Phase.RUNNING:
                 return {}
         if self._error is not None:
             raise self._error
-        if self._ending.is_set():
+        if self._phase >= Phase.STOPPING:
             raise ServiceError("the pipeline is closed (perhaps by another thread): create a new one")
         if self.end is not None and self.end.failed:
             raise VideoError(self.end.reason)
@@ -235,26 +244,36 @@ class Supervisor:
 
     def stop(self) -> None:
         """End the processes in order, and receive what they still send; at once if this is interrupted."""
-        self._ending.set()
+        self._enter(Phase.STOPPING)
         interruption: BaseException | None = None
-        while not self._ended.is_set():
+        while self._phase < Phase.ENDED:
             try:
-                self._ended.wait()  # of Python 3.11, a `join` that is interrupted takes the thread for ended
+                self._wait(Phase.ENDED)  # of Python 3.11, a `join` that is interrupted takes the thread for ended
             except BaseException as error:
-                self._hurries.set()
+                self._enter(Phase.HURRYING)
                 interruption = error
         if interruption is not None:
             raise interruption
 
+    def _enter(self, phase: Phase) -> None:
+        """Enter a phase, unless the run is in a later one."""
+        with self._changed:
+            self._phase = max(self._phase, phase)
+            self._changed.notify_all()
+
+    def _wait(self, phase: Phase) -> None:
+        with self._changed:
+            self._changed.wait_for(lambda: self._phase >= phase)
+
     # In the thread
 
-    def _run(self) -> None:
+    def _run(self, resources: ExitStack) -> None:
         """Receive until the detector has exited after the end of the run; then wait for `stop`."""
         try:
-            with self._stack:
+            with resources:
                 deadline = math.inf
                 try:
-                    while not self._ending.is_set() and self._clock() < deadline:
+                    while self._phase < Phase.STOPPING and self._clock() < deadline:
                         self._turn()
                         if self.end is not None:
                             deadline = min(deadline, self._clock() + EXIT_SECONDS)
@@ -263,18 +282,11 @@ class Supervisor:
                     self._receive_health()
                 except Exception as error:
                     self._error = error
-                self._end_frames()
-                self._ending.wait()
+                self._enter(Phase.OVER)
+                self._wait(Phase.STOPPING)
                 self._shut_down()
         finally:
-            self._end_frames()
-            self._ended.set()
-
-    def _end_frames(self) -> None:
-        """Let `next_frame` wait no longer."""
-        with self._changed:
-            self._over = True
-            self._changed.notify_all()
+            self._enter(Phase.ENDED)
 
     def _turn(self) -> None:
         """Receive the next frame or the end; from time to time the health, and look after the processes."""
@@ -290,7 +302,7 @@ class Supervisor:
         if now - before >= TURN_SECONDS:
             self._checked = now
             self._receive_health()
-            if self.end is None and not self._ending.is_set():
+            if self.end is None and self._phase < Phase.STOPPING:
                 with starting():
                     self._check_children(now, now - before)
 
@@ -328,10 +340,10 @@ class Supervisor:
 
     def _restart(self, child: Child, code: int, now: float) -> None:
         """Restart a process that died with an exit code, or schedule that."""
-        if not self._folder.exists():  # with the file of its job, and the sockets
+        if not child.job.exists():
             raise ServiceError(
-                f"the {child.name} died ({child.ending(code)}) and cannot be restarted: the folder {self._folder} was "
-                "removed during the run; start again, with TMPDIR set to a folder that nothing cleans"
+                f"the {child.name} died ({child.ending(code)}) and cannot be restarted: the folder of the run, "
+                f"{child.job.parent}, was removed; start again, with TMPDIR set to a folder that nothing cleans"
             )
         if code == PERMANENT_FAILURE:
             raise ServiceError(child.log.last_line())
@@ -354,6 +366,6 @@ class Supervisor:
                 continue
             child.process.send_signal(signal.SIGTERM)
             limit = max(deadline, self._clock() + LEAST_SECONDS)
-            while child.code is None and not self._hurries.is_set() and self._clock() < limit:
+            while child.code is None and self._phase < Phase.HURRYING and self._clock() < limit:
                 self._turn()
         self._receive_health()
