@@ -33,7 +33,6 @@ if TYPE_CHECKING:  # the methods import them, so that the constructor starts the
 
 _ONCE = "a pipeline runs once, and this one has run: make another Pipeline to track the source again"
 _ALL_FRAMES = slice(None)
-_CLOSED = ExitStack()  # marks a pipeline that was closed
 
 
 class Pipeline:
@@ -163,14 +162,15 @@ class Pipeline:
         self.saved_models: list[Path] = []
         self.first_frame = None if after is None else after + 1
         self.first_time = 0.0
-        self._stack: ExitStack | None = None  # cleans up at the end, once the pipeline has started
-        self._endpoint = ""
-        self._rows = 0
+        self._life: Literal["new", "open", "closed"] = "new"
+        self._stack = ExitStack()  # cleans up at the end
+        self._supervisor: Supervisor | None = None  # None before the start
+        self._endpoint = ""  # empty before the start
+        self._rows = 0  # number of tracks that were received
         self._rest: deque[Track] = deque()  # tracks of the last frame that were not yielded yet
-        self._supervisor: Supervisor | None = None
 
     def __enter__(self) -> Self:
-        if self._stack is not None:
+        if self._life != "new":
             raise ServiceError(_ONCE)
         from catstream.processes.state import locked_for_run, saved
         from catstream.processes.supervisor import Supervisor
@@ -187,8 +187,8 @@ class Pipeline:
             stack.enter_context(saved(self._save_models, state, settings, self.saved_models.append))
             self._supervisor = Supervisor(job, folder, self._start)
             stack.callback(self._supervisor.stop)  # before the models are saved, from the compressor's last checkpoint
-            self._endpoint, self._stack = str(endpoint), stack.pop_all()
             self._generation = generation()  # a copy of this process that is forked later does not end the run
+            self._endpoint, self._stack, self._life = str(endpoint), stack.pop_all(), "open"
         return self
 
     def _started(self, endpoint: str) -> Job:
@@ -214,26 +214,26 @@ class Pipeline:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        stack, self._stack = self._stack, _CLOSED
-        if stack is not None and stack is not _CLOSED and not forked(self._generation):
-            stack.__exit__(kind, error, trace)
+        was_open, self._life = self._life == "open", "closed"
+        if was_open and not forked(self._generation):
+            self._stack.__exit__(kind, error, trace)
 
     def close(self) -> None:
         """Stop the processes in order, after they have stored everything. The pipeline cannot be started again."""
         self.__exit__(None, None, None)
 
     def __del__(self) -> None:
-        if getattr(self, "_stack", None) not in (None, _CLOSED) and not forked(self._generation):
+        if getattr(self, "_life", "new") == "open" and not forked(self._generation):
             text = f"{self!r} was not closed: use it in a `with`"
             self.close()
             warnings.warn(text, ResourceWarning, source=self, stacklevel=1)  # last: it may be an error
 
     def __repr__(self) -> str:
-        life = "new" if self._stack is None else "closed" if self._stack is _CLOSED else f"at {self._endpoint}"
+        life = f"at {self._endpoint}" if self._life == "open" else self._life
         return f"<catstream.Pipeline of {without_password(self.source)!r}, {life}>"
 
     def __iter__(self) -> Iterator[Track]:
-        return self._run() if self._stack is None else self._tracks()
+        return self._run() if self._life == "new" else self._tracks()
 
     def _run(self) -> Iterator[Track]:
         with self:
@@ -280,7 +280,7 @@ class Pipeline:
     @property
     def _running(self) -> Supervisor:
         """The processes of the run, while it is open."""
-        if self._stack is _CLOSED:
+        if self._life == "closed":
             raise ServiceError(_ONCE)
         if self._supervisor is None:
             raise ServiceError("the pipeline was not started yet: use it in a `with`, or iterate it")
