@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -95,7 +95,7 @@ class RunProgress:
         figures.append(f"{pipeline.health.get('compressor', {}).get('leaves', 0):.0f} leaves")
         return f"{state:13} {'  '.join(figures)}"
 
-    def summary(self, results: Sequence[str]) -> str:
+    def summary(self) -> str:
         """The closing lines of the run."""
         self.idle()
         rate = f"first track after {self._first:.2f} s"
@@ -122,7 +122,8 @@ class RunProgress:
             lines.append(f"processes restarted: {self._pipeline.restarts}")
         if self.not_written:
             lines.append(f"not written: {counted(self.not_written, 'frame')}")
-        if results:
+        files = [self._pipeline.results.output, *(self._pipeline.results.write or ())]
+        if results := [str(file) for file in files if file is not None and file.exists()]:
             here = f"{Path.cwd()}/"
             lines.append(f"results: {', '.join(place.removeprefix(here) for place in results)}")
         return "\n".join(lines)

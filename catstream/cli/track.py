@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from itertools import combinations
@@ -55,10 +55,6 @@ if TYPE_CHECKING:
     from catstream.web.server import Server
 
 _SAME = 0.95  # overlap of boxes that were meant to be one
-_COMPLETE = (
-    "no frames remained to track, the run in {} is complete: to track the source again, start a new run in another "
-    "folder (--state DIR)"
-)
 
 
 def _files_only(_: click.Context, __: click.Parameter, destinations: tuple[str, ...]) -> tuple[str, ...]:
@@ -148,10 +144,10 @@ def track(
         )
     if UNNAMED in saved and len(boxes) + len(models) > 1:
         raise click.UsageError("--save-model FILE is for a single object: pass NAME=FILE for each of several")
-    console, notice = messages(), ""
+    notes: list[str] = []
     if continues and state is not None and contains_run(state):
         resume, state, boxes, models = state, None, {}, {}
-        notice = f"the resumed run in {resume} keeps its objects"
+        notes.append(f"the resumed run in {resume} keeps its objects")
     pipeline = Pipeline(
         source,
         boxes or None,
@@ -172,14 +168,65 @@ def track(
     )
     run = _Run(pipeline, resume or state, resume is not None, STDOUT in write, overwrite, view)
     run.check()
-    doubts = _doubtful(boxes, *pipeline.size)
+    notes += _doubtful(boxes, *pipeline.size)
     objects = {*boxes, *models}
     if objects and (unknown := saved.keys() - objects - {UNNAMED}):  # without a name, the only one is meant
         names = listed(sorted(unknown))
-        doubts.append(f"there is no object {names} yet: its model is saved if one begins under this name")
-    for line in doubts:
+        notes.append(f"there is no object {names} yet: its model is saved if one begins under this name")
+    console = messages()
+    for line in notes:
         console.print(line)
-    run.execute(console, notice)
+    outcome = run.execute(console)
+    for line in outcome.lines():
+        console.print(line)
+    if outcome.interrupted:
+        stopped(outcome.interruption())
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """The end of a run.
+
+    folder      folder of its state; None for none
+    is_resumed  whether the run of the folder has continued
+    frames      number of tracked frames
+    missing     results that another program removed, or that were never written
+    models      files of the models to save; `saved`: of the saved ones
+    """
+
+    folder: Path | None
+    is_resumed: bool
+    frames: int = 0
+    missing: Sequence[str] = ()
+    models: Sequence[Path] = ()
+    saved: Sequence[Path] = ()
+    interrupted: bool = False
+
+    def lines(self) -> Iterator[str]:
+        """Yield the lines after the summary."""
+        if self.missing:
+            yield f"missing results, removed or never written: {', '.join(self.missing)}"
+        if not self.frames and not self.is_resumed:
+            yield "no frame was tracked"
+        elif not self.frames and not self.interrupted:
+            yield (
+                f"no frames remained to track, the run in {self.folder} is complete: to track the source again, start "
+                "a new run in another folder (--state DIR)"
+            )
+        yield from (f"saved model: {file}" for file in self.saved)
+
+    def interruption(self) -> str:
+        """Return what an interrupted run leaves, and how to continue it."""
+        parts = ["some results are missing"] if self.missing else []
+        if not self.missing and (self.frames or self.is_resumed):
+            parts.append("the results so far are kept")
+        if unsaved := [str(file) for file in self.models if file not in self.saved]:
+            parts.append(f"not saved: {', '.join(unsaved)}")
+        if self.folder is not None and contains_run(self.folder):
+            parts.append(f"to continue: catstream track --resume {quote(str(self.folder))}")
+        elif self.folder is not None:
+            parts.append(f"the state in {self.folder} was removed, so the run cannot be resumed")
+        return "; ".join(parts)
 
 
 @dataclass(frozen=True, slots=True)
@@ -222,14 +269,12 @@ class _Run:
         for file in set(results.models.values()) - set(pipeline.earlier_results.models.values()):
             check_result(file, overwrite=self.overwrite, source=pipeline.source, made=results.output)
 
-    def execute(self, console: Console, notice: str) -> None:
-        """Run to the end, and print a summary, also of a run that an error ends, and how to continue."""
-        pipeline, files = self.pipeline, self.files
+    def execute(self, console: Console) -> Outcome:
+        """Run to the end, and print a summary, also of a run that an error ends."""
+        pipeline, files, models = self.pipeline, self.files, [*self.pipeline.results.models.values()]
         if self.is_resumed:
-            has_models = all(file.exists() for file in pipeline.results.models.values())
-            if has_models and files.is_complete(pipeline.frames):
-                console.print(_COMPLETE.format(self.folder))
-                return
+            if all(file.exists() for file in models) and files.is_complete(pipeline.frames):
+                return Outcome(self.folder, is_resumed=True)
             skip_damaged = pipeline.settings.run.skip_damaged
             pipeline.first_frame, pipeline.first_time = files.position(skip_damaged=skip_damaged)
         page = None if self.view is None else self._page(self.view)  # a port in use is an error before the run
@@ -238,42 +283,17 @@ class _Run:
             # The files are closed after the processes, which would track on meanwhile, for none of them; the page is
             # served until it shows the end.
             with ExitStack() as closed_last, pipeline:
-                if notice:
-                    console.print(notice)
                 if page is not None:
-                    feed, server = page
-                    feed.address = Address(pipeline.endpoint, keys=pipeline.settings.run.keys)
-                    closed_last.enter_context(server.in_background())
-                    closed_last.callback(feed.wait_for_end)
-                    for url in server.urls:
-                        console.print(f"page: {url}")
+                    self._serve(*page, closed_last, console)
                 self._write_tracks(progress, closed_last, console)
         except KeyboardInterrupt:
             interrupted = True
         finally:
             if progress.frames and not isinstance(sys.exception(), BrokenPipeError):
-                results = [*filter(None, [pipeline.results.output]), *(pipeline.results.write or ())]
-                console.print(progress.summary([str(path) for path in results if path.exists()]))
-        missing = files.missing() if progress.frames else []
-        if missing:
-            console.print(f"missing results, removed or never written: {', '.join(missing)}")
-        if not progress.frames and not self.is_resumed:
-            console.print("no frame was tracked")
-        elif not progress.frames and not interrupted:
-            console.print(_COMPLETE.format(self.folder))
-        for file in pipeline.saved_models:
-            console.print(f"saved model: {file}")
-        if interrupted:
-            parts = ["some results are missing"] if missing else []
-            if not missing and (progress.frames or self.is_resumed):
-                parts.append("the results so far are kept")
-            if unsaved := [str(file) for file in pipeline.results.models.values() if file not in pipeline.saved_models]:
-                parts.append(f"not saved: {', '.join(unsaved)}")
-            if self.folder is not None and contains_run(self.folder):
-                parts.append(f"to continue: catstream track --resume {quote(str(self.folder))}")
-            elif self.folder is not None:
-                parts.append(f"the state in {self.folder} was removed, so the run cannot be resumed")
-            stopped("; ".join(parts))
+                console.print(progress.summary())
+        missing = files.missing() if progress.frames else ()
+        saved = pipeline.saved_models
+        return Outcome(self.folder, self.is_resumed, progress.frames, missing, models, saved, interrupted)
 
     @staticmethod
     def _page(view: HostPort) -> tuple[PipelineFeed, Server]:
@@ -283,6 +303,14 @@ class _Run:
 
         feed = PipelineFeed(Address())
         return feed, server_of(Site(feed), view)
+
+    def _serve(self, feed: PipelineFeed, server: Server, stack: ExitStack, console: Console) -> None:
+        """Serve the page until it shows the end of the run."""
+        feed.address = Address(self.pipeline.endpoint, keys=self.pipeline.settings.run.keys)
+        stack.enter_context(server.in_background())
+        stack.callback(feed.wait_for_end)
+        for url in server.urls:
+            console.print(f"page: {url}")
 
     def _write_tracks(self, progress: RunProgress, stack: ExitStack, console: Console) -> None:
         """Write every track to all files, which the stack closes, and show it."""

@@ -11,6 +11,7 @@ import pytest
 from catstream.base.box import Box
 from catstream.cli.common import Interrupts
 from catstream.cli.progress import RunProgress
+from catstream.processes.job import Results
 from catstream.wire.messages import Track
 
 SIGNALS = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
@@ -18,7 +19,8 @@ SIGNALS = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
 
 def counted(seen, **pipeline):
     """The progress of a run after the tracks of some frames."""
-    progress = RunProgress(SimpleNamespace(lost_seconds=0, holding="", totals={}, restarts=0, **pipeline))
+    run = {"lost_seconds": 0, "holding": "", "totals": {}, "restarts": 0, "results": Results()}
+    progress = RunProgress(SimpleNamespace(**run, **pipeline))
     for tracks in seen:
         progress.count(tracks)
     return progress
@@ -48,7 +50,7 @@ def test_of_several_objects_the_line_has_the_scores_and_the_summary_a_line_for_e
     progress = counted([{"anna": each, "ben": ben} for each in anna[::-1]], live=False, frames=9, health={})
     assert progress.line().startswith("1/2 present   2/9")
     assert "anna +0.90  ben +0.10" in progress.line()
-    assert progress.summary([]).splitlines()[1:] == [
+    assert progress.summary().splitlines()[1:] == [
         "  anna: present in 1 of 2 frames, model version 7",
         "  ben: present in 0 of 2 frames, model version 4",
     ]

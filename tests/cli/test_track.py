@@ -8,6 +8,7 @@ import signal
 import socket
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, suppress
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -17,9 +18,11 @@ import pytest
 from catstream.base.box import Box
 from catstream.cli import progress as progress_module
 from catstream.cli.progress import RunProgress
+from catstream.cli.track import Outcome
 from catstream.client.saved_model import SavedModel
 from catstream.output.track_log import Log
 from catstream.pipeline import Pipeline
+from catstream.processes.job import JOB, Results
 from catstream.video.source import open_source
 
 FILES = ["demo.csv", "demo.mp4", "demo.ndjson"]
@@ -180,6 +183,16 @@ def test_a_model_that_was_not_saved_before_an_interrupt_is_not_said_to_be(video,
     assert errors.endswith(f"no frame was tracked\nstopped: not saved: {tmp_path / 'model'}\n")
 
 
+def test_interrupted_run_states_what_is_left_and_how_to_continue(tmp_path):
+    outcome = Outcome(tmp_path, False, 5, missing=["a.csv"], models=["m"], interrupted=True)
+    assert "a.csv" in next(outcome.lines())
+    removed = f"the state in {tmp_path} was removed, so the run cannot be resumed"
+    assert outcome.interruption() == f"some results are missing; not saved: m; {removed}"
+    (tmp_path / JOB).touch()
+    kept = replace(outcome, missing=[], models=[]).interruption()
+    assert kept == f"the results so far are kept; to continue: catstream track --resume {tmp_path}"
+
+
 def test_doubtful_options_are_reported_before_the_run_and_saved_models_after_it(video, said, succeed, tmp_path):
     source, box = video
     words = ["--box", f"a={box}", "--box", f"b={box}", "--save-model", f"a={tmp_path / 'a'}"]
@@ -198,14 +211,14 @@ def test_doubtful_options_are_reported_before_the_run_and_saved_models_after_it(
 def test_time_in_which_a_run_waits_counts_neither_for_its_first_track_nor_its_rate(monkeypatch):
     seconds = [100.0]
     monkeypatch.setattr(progress_module.time, "perf_counter", lambda: seconds[0])
-    pipeline = SimpleNamespace(holding="", live=False, frames=9, health={}, totals={}, restarts=0)
+    pipeline = SimpleNamespace(holding="", live=False, frames=9, health={}, totals={}, restarts=0, results=Results())
     progress = RunProgress(pipeline)
     track = SimpleNamespace(box=None, model_version=1, state="lost", score=0.0)
     for passed, holding in [(0.5, ""), (190.0, "waiting"), (0.5, ""), (2.0, None), (60.0, "paused"), (2.0, None)]:
         seconds[0] += passed
         pipeline.holding = holding or ""
         progress.idle() if holding is not None else progress.count({"": track})
-    assert "2 frames, present in 0, 0 frames/s, first track after 3.00 s" in progress.summary([])
+    assert "2 frames, present in 0, 0 frames/s, first track after 3.00 s" in progress.summary()
     assert progress._seconds() == pytest.approx(2.0)
 
 
