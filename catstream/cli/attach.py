@@ -28,8 +28,7 @@ from catstream.processes.job import Job
 from catstream.processes.state import learned
 from catstream.wire.channels import PUBLIC
 
-_IDLE_SECONDS = REASON_SECONDS  # without a message, after which `idle` is called; then repeated
-_SILENT_SECONDS = 3 * _IDLE_SECONDS  # after which `watch` and `sink` say why
+_SILENT_SECONDS = 3 * REASON_SECONDS  # after which `watch` and `sink` say why
 _OLD_SECONDS = 5.0  # age of the newest message from which they say that the reader is slow
 
 
@@ -127,7 +126,7 @@ def watch(channel: str, address: Address, wait: float, name: str | None, as_json
 
 def with_silence_warnings(messages: Subscription[Any], idle: Callable[[], None] = lambda: None) -> Iterator[Any]:
     """Yield the messages; warn if they are old, and if none arrives, once for each reason, and call `idle` then."""
-    messages.timeout, reason, old, silent = _IDLE_SECONDS, "", False, 0.0
+    messages.timeout, reason, old, silent = REASON_SECONDS, "", False, 0.0
     while True:
         try:
             for message in messages:
@@ -139,12 +138,12 @@ def with_silence_warnings(messages: Subscription[Any], idle: Callable[[], None] 
             return
         except SilenceError as error:
             idle()
-            silent += _IDLE_SECONDS
+            silent += REASON_SECONDS
             if silent < _SILENT_SECONDS:
                 continue
             before, reason = reason, re.sub(r"\d+", "", str(error))  # seconds that pass are no other reason
             if reason != before:
-                click.echo(f"waiting: {str(error).replace(f'{_IDLE_SECONDS:g} s', f'{silent:g} s', 1)}", err=True)
+                click.echo(f"waiting: {str(error).replace(f'{REASON_SECONDS:g} s', f'{silent:g} s', 1)}", err=True)
 
 
 def _described(value: bytes | np.ndarray) -> dict[str, object]:

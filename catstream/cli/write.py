@@ -19,12 +19,13 @@ from catstream.cli.attach import wait_for_pipeline, with_address, with_silence_w
 from catstream.cli.common import INTERRUPTS
 from catstream.cli.options import Command
 from catstream.client.address import Address
-from catstream.client.attach import REPORT_SECONDS, subscribe
+from catstream.client.attach import subscribe
 from catstream.errors import SettingsError, SilenceError
 from catstream.output.destinations import SINKS, Header, Origin, TrackedFrame
 from catstream.output.events import check_zones
 from catstream.output.options import OPTIONS, parse
 from catstream.output.track_log import RunFiles
+from catstream.wire.commands import ANSWER_SECONDS
 
 _REPORTS = 12  # health reports of all processes in four seconds, one of which is from the detector
 
@@ -75,7 +76,7 @@ def _with_options(command: Command) -> Command:
 def _header(address: Address) -> Header:
     """The header of a log, as far as the detector of the pipeline reports the run."""
     header = Header()
-    with subscribe(address, "health", timeout=REPORT_SECONDS) as reports, suppress(SilenceError):
+    with subscribe(address, "health", timeout=ANSWER_SECONDS) as reports, suppress(SilenceError):
         for report in islice(reports, _REPORTS):
             if report.process == "detector":
                 of = report.counters

@@ -16,13 +16,12 @@ import os
 from typing import Any
 
 from catstream.client.address import Address
-from catstream.client.control import ANSWER_SECONDS, Control
+from catstream.client.control import Control
 from catstream.client.following import StreamSubscription
 from catstream.client.subscription import Subscription
 from catstream.errors import ServiceError
+from catstream.wire.commands import ANSWER_SECONDS
 from catstream.wire.endpoint import Endpoint
-
-REPORT_SECONDS = 5.0  #: for a health report, by default; each process of a running pipeline sends one every second
 
 
 def subscribe(
@@ -100,7 +99,7 @@ def control(
     return Control(Address.parse(address, keys).resolve(), timeout=timeout)
 
 
-def wait_until_running(address: Address, seconds: float = REPORT_SECONDS) -> Endpoint:
+def wait_until_running(address: Address, seconds: float = ANSWER_SECONDS) -> Endpoint:
     """Wait for a health report of the pipeline, and return its endpoint; tracks and models may pause for long.
 
     SilenceError if no report arrives in time, ServiceError if the pipeline has ended, or as for `subscribe`.

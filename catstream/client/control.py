@@ -24,13 +24,11 @@ from catstream.base.names import UNNAMED, boxes_by_name, check_name
 from catstream.client.saved_model import SavedModel
 from catstream.errors import CommandRejectedError, ServiceError, SilenceError
 from catstream.wire.channels import CONTROL, SAVED_MODELS
-from catstream.wire.commands import Requester
+from catstream.wire.commands import ANSWER_SECONDS, Requester
 from catstream.wire.discovery import source_at
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.messages import Answer, Command, ModelFile, Verb
 from catstream.wire.newest import Subscriber
-
-ANSWER_SECONDS = 5.0  #: limit for the answer to a command, by default
 
 
 class Control(AbstractContextManager["Control"]):

@@ -15,7 +15,7 @@ import msgspec
 
 from catstream.errors import ServiceError, SilenceError
 from catstream.wire.channels import REGISTRY
-from catstream.wire.commands import Requester
+from catstream.wire.commands import ANSWER_SECONDS, Requester
 from catstream.wire.discovery import fleets
 from catstream.wire.endpoint import Endpoint, resolved
 from catstream.wire.keys import Keys
@@ -23,8 +23,6 @@ from catstream.wire.messages import FleetStatus, Listing, Question, StreamStatus
 
 #: Port at which the registry of a cluster listens by default.
 REGISTRY_PORT = 5690
-
-_ANSWER_SECONDS = 5.0  # limit for an answer, by default
 
 
 class Registry(AbstractContextManager["Registry"]):
@@ -34,7 +32,7 @@ class Registry(AbstractContextManager["Registry"]):
     folder of the keys of this client, if the fleet requires keys.
     """
 
-    def __init__(self, fleet: str = "", keys: str = "", *, timeout: float = _ANSWER_SECONDS) -> None:
+    def __init__(self, fleet: str = "", keys: str = "", *, timeout: float = ANSWER_SECONDS) -> None:
         self.timeout = timeout
         own = Keys.load(keys) if keys else None
         fleet = fleet.removeprefix("fleet://").removeprefix("tcp://").rstrip("/")

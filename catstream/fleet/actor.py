@@ -41,8 +41,7 @@ from catstream.wire.messages import StreamState, StreamStatus, Track
 from catstream.wire.storage import Metadata
 
 FIRST_PAUSE_SECONDS = 1.0  # before a stream that failed starts again; doubled each time
-LONGEST_PAUSE_SECONDS = 60.0  # the most of these
-_FORGOTTEN_SECONDS = 60.0  # of running, after which earlier failures do not count
+LONGEST_PAUSE_SECONDS = 60.0  # the most of these; after so long without a failure, it is the first one again
 _TRACKS_SECONDS = 0.1  # longest wait for a frame
 _CHECK_SECONDS = 5.0  # between two checks of the claim if `every` is 0
 _STORE_RATE = 0.1e6  # bytes per second that are stored then: 9 GB a day
@@ -121,7 +120,7 @@ class Stream:
                 if self._has_tracked:  # what it has learned since the last state
                     self._due = 0.0
                     self._write()
-            pause = FIRST_PAUSE_SECONDS if time.monotonic() - began > _FORGOTTEN_SECONDS else pause
+            pause = FIRST_PAUSE_SECONDS if time.monotonic() - began > LONGEST_PAUSE_SECONDS else pause
             self._stop.wait(pause)
             pause = min(2 * pause, LONGEST_PAUSE_SECONDS)
 

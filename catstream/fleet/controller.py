@@ -35,8 +35,7 @@ NAMESPACE = "catstream"
 Models = dict[tuple[str, str], bytes]
 
 _TURN_SECONDS = 0.5  # between two looks at the actors
-_REPORT_SECONDS = 0.1  # longest wait of a look for the reports of all streams
-_QUESTION_SECONDS = 0.1  # longest wait for a question to the registry
+_WAIT_SECONDS = 0.1  # longest wait of a look for the reports of all streams, and for a question to the registry
 _GOODBYE_SECONDS = 2.0  # for clients, which ask every second, to learn that there is no stream any more
 _PAUSE_SECONDS = 5.0  # between two starts of one actor, at least: one may die each time, or be superseded
 SILENT_SECONDS = 120.0  # without an answer, after which a stream is started again: a busy machine may be slow to answer
@@ -194,7 +193,7 @@ class Controller:
         while not self._over.is_set():
             if self._registry is None or self._trouble is not None:
                 self._over.wait(_TURN_SECONDS)  # a client would take an empty answer for the end of its stream
-            elif self._registry.turn(_QUESTION_SECONDS):
+            elif self._registry.turn(_WAIT_SECONDS):
                 self._last_question = time.monotonic()
             if time.monotonic() < due:
                 continue
@@ -222,7 +221,7 @@ class Controller:
                 self._ask(name, self._actors.setdefault(name, Actor()), existing.get(name))
             calls = [actor.call for actor in self._actors.values() if actor.call is not None]
         if calls:  # a stream that runs answers at once
-            ray.wait(calls, num_returns=len(calls), timeout=_REPORT_SECONDS)
+            ray.wait(calls, num_returns=len(calls), timeout=_WAIT_SECONDS)
         with self._lock:
             for name, actor in sorted(self._actors.items()):
                 is_superseded = self._hear(name, actor)

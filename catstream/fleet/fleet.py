@@ -46,14 +46,13 @@ from catstream.client.saved_model import SavedModel
 from catstream.errors import CatstreamError, FleetError, require_fleet
 from catstream.fleet.controller import NAMESPACE, Controller, actor_name, named_actors
 from catstream.fleet.spec import FleetSpec, StreamSpec
-from catstream.fleet.store import Store
+from catstream.fleet.store import CONNECT_SECONDS, Store
 from catstream.wire.discovery import private_folder
 from catstream.wire.messages import FleetStatus
 
 ANSWER_SECONDS = 60.0  # limit for the controller to answer; Ray starts it again meanwhile, if it has died
 DOWN_SECONDS = 60.0  # limit for all streams to store their state and to end
 _LEAVE_SECONDS = 10.0  # limit for the process whose node it is to notice that the fleet has ended
-_REACH_SECONDS = 3.0  # limit to connect to the head
 _LOOK_SECONDS = 0.2  # between two looks at any of these
 _STORE_BYTES = 80 << 20  # of Ray's object store: only saved models go through it
 
@@ -260,7 +259,7 @@ class Fleet(AbstractContextManager["Fleet"]):
                 raise FleetError(f"the fleet {self.name} is starting: try again once it runs") from None
         host, _, port = address.rpartition(":")
         try:
-            socket.create_connection((host, int(port)), _REACH_SECONDS).close()
+            socket.create_connection((host, int(port)), CONNECT_SECONDS).close()
         except (OSError, ValueError) as error:
             why = getattr(error, "strerror", None) or "no answer"
             if not self._address:

@@ -48,7 +48,7 @@ from catstream.fleet.spec import check_fleet_name
 from catstream.wire import storage
 
 STORE_SECONDS = 10.0  # limit of a request to a server
-_CONNECT_SECONDS = 3.0  # limit to connect to it
+CONNECT_SECONDS = 3.0  # limit to connect to a server
 
 _FOLDERS = ("streams", "models", "fleet")
 _CLAIM = "claim"
@@ -146,7 +146,7 @@ class Store:
                 raise StoreError(f"the store {self._url} is not a folder on this machine: is its file system mounted?")
             return LocalStore(self._folder, automatic_cleanup=True)
         limits: Any = {"timeout": timedelta(seconds=STORE_SECONDS)}
-        limits |= {"connect_timeout": timedelta(seconds=_CONNECT_SECONDS)}
+        limits |= {"connect_timeout": timedelta(seconds=CONNECT_SECONDS)}
         return from_url(
             self._url,
             client_options=limits | {"allow_http": True},  # at an address that begins with http

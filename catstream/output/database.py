@@ -17,7 +17,7 @@ from catstream.base.files import REMEDIES, open_locked
 from catstream.base.text import counted
 from catstream.errors import VideoError
 from catstream.output.destinations import Header, Origin, Sink, TrackedFrame
-from catstream.output.remote import Warnings
+from catstream.output.remote import CLOSE_SECONDS, Warnings
 from catstream.wire.messages import Track
 
 #: Column -> its type in SQLite. `seconds` is the time since the start of the source, `pts` the time stamp in a live
@@ -38,8 +38,6 @@ _INSERT = f"INSERT OR REPLACE INTO tracks ({_NAMES}) VALUES ({', '.join('?' for 
 
 #: Frames that wait for a locked database at most.
 _MOST_WAITING = 1 << 16
-
-_CLOSE_SECONDS = 5.0  # wait for a locked database at the end
 
 #: The error of the system for errors of SQLite.
 _ERRNO = {sqlite3.SQLITE_FULL: errno.ENOSPC, sqlite3.SQLITE_READONLY: errno.EROFS, sqlite3.SQLITE_IOERR: errno.EIO}
@@ -85,7 +83,7 @@ class SqliteSink(Sink):
     def close(self) -> None:
         """Close the database; VideoError if it is still locked after some seconds."""
         try:
-            self._flush(_CLOSE_SECONDS)
+            self._flush(CLOSE_SECONDS)
             if lost := len(self._waiting) + self.missed:
                 raise VideoError(
                     f"{self._dest} lacks {counted(lost, 'frame')}, as another program locked it: if the run has an "

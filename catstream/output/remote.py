@@ -23,7 +23,7 @@ from catstream.wire.messages import Health, Preview, Track
 #: Messages that wait for a destination that is away or slow; further ones are dropped.
 QUEUED = 256
 
-#: Seconds at the end of a run in which the backlog is sent.
+#: Seconds at the end of a run in which the backlog is sent, or written to a locked database.
 CLOSE_SECONDS = 5.0
 
 _STABLE_SECONDS = 10.0  # without a failure, after which a destination has recovered

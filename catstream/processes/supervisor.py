@@ -35,9 +35,8 @@ from catstream.wire.results import ResultsReceiver
 RESTART_SECONDS = 0.1  #: before the second restart in a minute; doubled for each further one
 RESTARTS, RECENT_SECONDS = 5, 60.0  #: how often a process may be restarted, and in which time
 APART_SECONDS = 3.0  #: that a process may have ended before the run; then it is started again
-SHUTDOWN_SECONDS = 12.0  #: limit for all processes to end before they are killed
+SHUTDOWN_SECONDS = 12.0  #: limit for all processes to end, and for the detector after the end of the stream
 LEAST_SECONDS = 0.1  #: for each of them, also if the others have used all of that time
-EXIT_SECONDS = 12.0  #: limit for the detector to exit after the end of the stream was received
 ENDED = (0, SOURCE_FAILED)  #: exit codes of a process that has ended with the run
 
 _LAST_LINE = 2000  # bytes at the end of a log in which the last line is searched for
@@ -276,7 +275,7 @@ class Supervisor:
                     while self._phase < Phase.STOPPING and self._clock() < deadline:
                         self._turn()
                         if self.end is not None:
-                            deadline = min(deadline, self._clock() + EXIT_SECONDS)
+                            deadline = min(deadline, self._clock() + SHUTDOWN_SECONDS)
                             if self._children["detector"].code in ENDED:
                                 break
                     self._receive_health()

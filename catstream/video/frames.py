@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 
 #: Frames per second of a source without time stamps, if none is given.
 RATE = 25.0
+#: Between two calls of the `idle` of a live source while it has no frame.
+IDLE_SECONDS = 0.1
 
 _CHANNELS = (1, 3, 4)
 _HALF_STEP = 0.5 / 255  # interpolation may exceed the range from 0 to 1 by this much

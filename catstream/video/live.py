@@ -26,13 +26,12 @@ from catstream.base.addresses import without_password
 from catstream.base.settings import RunSettings
 from catstream.errors import VideoError
 from catstream.video.connection import ENDED, INVALID, LONGEST_SEGMENT, Connection, loss_of, modes_of
-from catstream.video.frames import RATE, Frame, Source, UprightConverter
+from catstream.video.frames import IDLE_SECONDS, RATE, Frame, Source, UprightConverter
 from catstream.video.reconnect import Attempt, Loss, next_attempt
 
 if TYPE_CHECKING:
     from av import VideoFrame
 
-_IDLE_SECONDS = 0.1
 _POLL_SECONDS = 1.0  # between two requests of a still picture, which cameras update about as often
 _LONGEST_PLAYLIST = 60.0  # seconds
 _QUIET_SECONDS = 600.0  # between two log lines with the same reason
@@ -146,10 +145,10 @@ class Reader:
         self._thread.start()
 
     def wait(self) -> tuple[float, VideoFrame] | None:
-        """Return the newest frame and its arrival time, or None if no frame arrives within `_IDLE_SECONDS`."""
+        """Return the newest frame and its arrival time, or None if no frame arrives within `IDLE_SECONDS`."""
         with self._changed:
             if self._newest is None and not self.closed.is_set():
-                self._changed.wait(_IDLE_SECONDS)
+                self._changed.wait(IDLE_SECONDS)
             newest, self._newest = self._newest, None
         return None if self.closed.is_set() else newest
 

@@ -23,14 +23,13 @@ import numpy as np
 from catstream.base.box import Box
 from catstream.errors import VideoError
 from catstream.video import rendered
-from catstream.video.frames import Frame, Source
+from catstream.video.frames import IDLE_SECONDS, Frame, Source
 
 #: Sources that begin with this are live demos.
 PREFIX = "demo:"
 
 _SIZE = (320, 240)
 _BEGIN, _IMAGES = 60, 125  # first of the images in the demo video, and their number
-_IDLE_SECONDS = 0.1
 
 
 def _seed(text: str) -> int:
@@ -77,8 +76,8 @@ class LiveDemo(Source):
             self._opened = monotonic()
         due = self._opened + (self._last + 1 - self._start) / self.rate
         while not self._closed.is_set() and (seconds := due - monotonic()) > 0:
-            self._closed.wait(min(seconds, _IDLE_SECONDS))
-            if seconds > _IDLE_SECONDS and self._idle is not None and self._idle():
+            self._closed.wait(min(seconds, IDLE_SECONDS))
+            if seconds > IDLE_SECONDS and self._idle is not None and self._idle():
                 raise StopIteration
         if self._closed.is_set():
             raise StopIteration

@@ -18,12 +18,13 @@ import zmq
 from catstream.base.clock import RunningClock
 from catstream.wire.channels import Channel
 from catstream.wire.endpoint import Endpoint
+from catstream.wire.go_back_n import PATIENCE_SECONDS
 from catstream.wire.messages import Answer as CommandAnswer
 from catstream.wire.messages import Command
 from catstream.wire.socket import ChannelSocket
 
 LOOK_SECONDS = 0.05  #: from one look at the connection to the next
-RETRY_SECONDS = 0.2  #: after which a question is sent again; a large one later
+ANSWER_SECONDS = 5.0  #: limit for an answer, by default
 RETRY_BYTES_PER_SECOND = 1e6  #: of a slow network: a large question is sent again after so much longer
 _MAX_QUESTIONS = 64  # that wait, that are remembered with their answers, and that are received at once
 _LONGEST_QUESTION = 1 << 20  # bytes; once so many were received, the other questions wait
@@ -59,7 +60,7 @@ class Requester(ChannelSocket[Question | Answer], Generic[Question, Answer]):
         while now < seconds:
             if now >= repeat_at or not self._in_transit:
                 self._send(data)
-                repeat_at = now + RETRY_SECONDS + len(data) / RETRY_BYTES_PER_SECOND
+                repeat_at = now + PATIENCE_SECONDS + len(data) / RETRY_BYTES_PER_SECOND
             if (answer := self.receive(question.id, min(seconds - now, LOOK_SECONDS))) is not None:
                 return answer
             now = clock()

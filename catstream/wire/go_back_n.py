@@ -30,7 +30,7 @@ from dataclasses import replace
 from catstream.errors import ProtocolError, StreamRewoundError
 from catstream.wire.messages import Position
 
-PATIENCE_SECONDS = 0.2  #: without a reply, after which a sender asks for the position; between two reports of a gap
+PATIENCE_SECONDS = 0.2  #: without a reply, after which a question is sent again; between two reports of a gap
 AGAIN_SECONDS = 2.0  #: within which a sender goes back once only on the same connection
 
 _MOST_BYTES = 256 << 20  # total size of the copies at which no further one is added

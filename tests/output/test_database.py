@@ -115,7 +115,7 @@ def test_frames_wait_in_memory_while_another_program_locks_the_database(tmp_path
 
 def test_frames_beyond_those_that_wait_are_counted_and_reported_at_the_end(tmp_path, monkeypatch):
     monkeypatch.setattr("catstream.output.database._MOST_WAITING", 2)
-    monkeypatch.setattr("catstream.output.database._CLOSE_SECONDS", 0.0)
+    monkeypatch.setattr("catstream.output.database.CLOSE_SECONDS", 0.0)
     path = tmp_path / "t.sqlite"
     sink = open_sink(str(path), Origin())
     with closing(sqlite3.connect(path, isolation_level=None)) as other:
