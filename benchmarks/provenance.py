@@ -50,7 +50,7 @@ def machine() -> dict[str, object]:
         if pool["user_api"] == "blas"
     }
     return {
-        **catstream.measure.provenance.machine(),
+        **catstream.measure.provenance.provenance([])["machine"],
         "opencv": cv2.__version__,
         "blas": sorted(blas),
         **{library: version(library) for library in _LIBRARIES},

@@ -228,11 +228,6 @@ def latencies_to_answer(due: Float64, answers: list[tuple[float, int]], end: flo
         if number >= 0:
             place = min(number, len(due) - 1)
             first[place] = min(first[place], moment)
-    return latencies(due, first, end)
-
-
-def latencies(due: Float64, first: Float64, end: float) -> Float64:
-    """Return the same from the arrival time of the first answer to each frame, infinite if there is none."""
     first = np.minimum.accumulate(first[::-1])[::-1]
     return np.asarray(np.minimum(first, end) - due)
 

@@ -12,7 +12,7 @@ from os import getpid
 from time import monotonic
 
 from catstream.client.address import Address
-from catstream.errors import ServiceError, errors_in
+from catstream.errors import ServiceError, SettingsError, errors_in
 from catstream.measure.camera import Camera, Schedule
 from catstream.measure.latency import Observations, Usage, measure, observed
 from catstream.measure.load import Stream
@@ -44,8 +44,6 @@ def run(plan: Plan, video: Video, report: Report) -> Result:
                 pids["subscribers"] = readers
             return pids | {"camera": [camera.pid], "load test": [getpid()]}
 
-        for group in groups:
-            group.begin(observations)
         schedules = camera.play(Schedule(monotonic() + _LEAD_SECONDS + 0.5 / plan.rate, plan.rate))
         usage.read(processes())
         next_reading = schedules[0].start + _READING_SECONDS
@@ -63,11 +61,10 @@ def run(plan: Plan, video: Video, report: Report) -> Result:
         usage.read(processes(), is_last=True)
         report("ending", 1.0, "")
         _stop(streams)
-        for group in groups:
-            group.wait()
-    due = [min(plan.frames, schedule.following(end)) if interrupted else plan.frames for schedule in schedules]
-    if min(due) <= 0:
-        raise KeyboardInterrupt
+        due = [min(plan.frames, schedule.following(end)) if interrupted else plan.frames for schedule in schedules]
+        if min(due) <= 0:
+            raise KeyboardInterrupt
+        subscribers = [group.receipts(observations, schedules, due, end) for group in groups]
     return Result(
         plan=plan,
         seconds=min(due) / plan.rate,
@@ -76,7 +73,7 @@ def run(plan: Plan, video: Video, report: Report) -> Result:
             for observation, schedule, number, stream in zip(observations, schedules, due, streams, strict=True)
         ],
         readings=usage.readings,
-        subscribers=[group.receipts(observations, schedules, due, end) for group in groups],
+        subscribers=subscribers,
         camera_late=late,
         errors=[f"stream {stream.number}: {stream.error}" for stream in streams if stream.error],
         interrupted=interrupted,
@@ -213,6 +210,9 @@ def run_load_test(
     find : search for the highest number of this parameter that meets the limits, beginning with the one in the plan
     report, done : functions that are called with the progress, and after each run
     """
+    has_fast = find == "subscribers" or plan.subscribers > plan.slow_subscribers
+    if not has_fast and any(limit.name.startswith("subscriber-") for limit in limits):
+        raise SettingsError("a limit of subscribers requires fast ones: raise --subscribers, or omit the limit")
     load_test = LoadTest(limits, find)
 
     def holds(number: int) -> bool:

@@ -1,22 +1,24 @@
-"""The subscribers of a load test: processes that receive the messages of a pipeline, and record when they arrive."""
+"""The subscribers of a load test: processes that receive the messages of pipelines, and record when they arrive."""
 
 from __future__ import annotations
 
 import os
+from array import array
 from collections.abc import Sequence
 from contextlib import ExitStack
+from multiprocessing.connection import Connection
 from selectors import EVENT_READ, DefaultSelector
 from time import monotonic, sleep
-from typing import Any, NamedTuple, Self
+from typing import Any, Self
 
 import numpy as np
 
-from catstream.base.arrays import Float64
 from catstream.base.system import die_with
-from catstream.base.workers import SPAWN, sharing, sigint_blocked
+from catstream.base.workers import SPAWN, sigint_blocked
 from catstream.client.address import Address
+from catstream.errors import ServiceError
 from catstream.measure.camera import Schedule
-from catstream.measure.latency import Observations, Receipts, latencies
+from catstream.measure.latency import Observations, Receipts, latencies_to_answer
 from catstream.measure.load_result import Plan
 from catstream.wire.channels import PUBLIC
 from catstream.wire.messages import End, Features, Track
@@ -24,29 +26,7 @@ from catstream.wire.newest import GapCounter, Subscriber
 
 _PER_PROCESS = 100  # one process with 500 subscribers receives their messages later than five with 100
 _SLOW_SECONDS = 0.5  # between two messages of a slow subscriber
-_MORE_FRAMES = 1000  # of the still image and of repeats after a restart, which have no number in the schedule
 _DRAIN_SECONDS = 20.0  # timeout for fast subscribers to receive the last messages
-
-
-class _Record(NamedTuple):
-    """Memory that the processes of the subscribers share with the load test.
-
-    begin : number of the first frame whose receipt is recorded
-    received, missed : numbers of frames, int (subscribers,)
-    moments : time of the receipt of each frame from `begin` on, 0 if there was none, float64 (fast * frames,)
-    frames : number of frames for which there is memory
-    """
-
-    begin: Any
-    received: Any
-    missed: Any
-    moments: Any
-    frames: int
-
-    @property
-    def rows(self) -> Float64:
-        """`moments` as an array, float64 (fast, frames)."""
-        return np.frombuffer(self.moments).reshape(-1, self.frames)
 
 
 class Subscribers:
@@ -56,20 +36,18 @@ class Subscribers:
     """
 
     def __init__(self, plan: Plan, stream: int, channel: str, address: Address) -> None:
-        self._stream, self._channel, self._fast = stream, channel, plan.subscribers - plan.slow_subscribers
-        frames = plan.frames + _MORE_FRAMES
-        with sharing():
-            begin, moments = SPAWN.RawValue("l", 1 << 62), SPAWN.RawArray("d", self._fast * frames)
-            received, missed = (SPAWN.RawArray("l", plan.subscribers) for _ in range(2))
-        self._record = _Record(begin, received, missed, moments, frames)
-
-        def processes(numbers: range, is_slow: bool) -> list[Any]:
-            parts = [numbers[first : first + _PER_PROCESS] for first in range(0, len(numbers), _PER_PROCESS)]
-            rest = is_slow, channel, address, self._record, os.getpid()
-            return [SPAWN.Process(target=_receive, args=(part, *rest), daemon=True) for part in parts]
-
-        self._fast_processes = processes(range(self._fast), is_slow=False)
-        self._processes = [*self._fast_processes, *processes(range(self._fast, plan.subscribers), is_slow=True)]
+        self._stream, self._channel = stream, channel
+        self._processes: list[Any] = []
+        self._fast: list[Connection] = []  # pipes to processes of fast subscribers
+        self._slow: list[Connection] = []
+        slow = plan.slow_subscribers
+        for total, pipes in ((plan.subscribers - slow, self._fast), (slow, self._slow)):
+            for first in range(0, total, _PER_PROCESS):
+                pipe, other = SPAWN.Pipe()
+                is_slow, count = pipes is self._slow, min(_PER_PROCESS, total - first)
+                task = count, is_slow, channel, address, other, os.getpid()
+                self._processes.append(SPAWN.Process(target=_receive, args=task, daemon=True))
+                pipes.append(pipe)
 
     @property
     def pids(self) -> list[int]:
@@ -78,34 +56,33 @@ class Subscribers:
     @property
     def connected(self) -> bool:
         """True if each subscriber has received a message."""
-        return all(self._record.received)
-
-    def begin(self, streams: Sequence[Observations]) -> None:
-        """Record the receipts of frames from the newest tracked one of the stream on."""
-        self._record.begin.value = streams[self._stream].tracks[-1][1].frame
-
-    def wait(self) -> None:
-        """Wait until each fast subscriber has received the end, with a timeout; some channels have no end."""
-        deadline = monotonic() + _DRAIN_SECONDS * (End in PUBLIC[self._channel].messages)
-        for process in self._fast_processes:
-            process.join(max(0.0, deadline - monotonic()))
+        return all(pipe.poll() for pipe in self._fast + self._slow)
 
     def receipts(
         self, streams: Sequence[Observations], schedules: Sequence[Schedule], due: Sequence[int], end: float
     ) -> Receipts:
-        """Return the measures of the fast subscribers; the parameters are those of `measure`, for all streams."""
-        schedule, frames = schedules[self._stream], due[self._stream]
-        times, latency = schedule.due_times(frames), np.empty((self._fast, frames), np.float32)
-        tracks = [track for _, track in streams[self._stream].tracks]
-        columns = np.array([track.frame for track in tracks], int) - self._record.begin.value
-        numbers = np.array([schedule.number(track.pts or 0.0) for track in tracks], int)
-        is_used = (columns >= 0) & (columns < self._record.frames) & (numbers >= 0) & (numbers < frames)
-        for number, moments in enumerate(self._record.rows if self._fast else ()):
-            first = np.zeros(frames)
-            first[numbers[is_used]] = moments[columns[is_used]]
-            latency[number] = latencies(times, np.where(first > 0, first, np.inf), end)
-        received, missed = (list(values[: self._fast]) for values in (self._record.received, self._record.missed))
-        return Receipts(self._stream, self._channel, latency, received, missed)
+        """Wait for the end of the pipeline, and return the measures of the fast subscribers.
+
+        The parameters are those of `measure`, for all streams.
+        """
+        schedule = schedules[self._stream]
+        times, latency, received, missed = schedule.due_times(due[self._stream]), [], [], []
+        numbers = {track.frame: schedule.number(track.pts or 0.0) for _, track in streams[self._stream].tracks}
+        deadline = monotonic() + _DRAIN_SECONDS * (End in PUBLIC[self._channel].messages)
+        for pipe in self._fast:
+            pipe.recv()  # it is connected
+            if not pipe.poll(max(0.0, deadline - monotonic())):
+                pipe.send(None)  # the channel has no end, or it was lost
+            if not pipe.poll(_DRAIN_SECONDS):
+                raise ServiceError("a process of the subscribers has exited: its error is printed above")
+            for receipts, gaps in pipe.recv():
+                # A restarted detector reuses numbers: what arrived before its frame was due is about another frame.
+                found = [(moment, numbers.get(frame, -1)) for frame, moment in zip(*receipts, strict=True)]
+                answers = [(moment, number) for moment, number in found if moment >= schedule.due(number)]
+                latency.append(latencies_to_answer(times, answers, end).astype(np.float32))
+                received.append(len(receipts[0]))
+                missed.append(gaps)
+        return Receipts(self._stream, self._channel, np.array(latency), received, missed)
 
     def __enter__(self) -> Self:
         with sigint_blocked():
@@ -119,36 +96,41 @@ class Subscribers:
             process.join()
 
 
-def _receive(numbers: range, is_slow: bool, channel: str, address: Address, record: _Record, parent: int) -> None:
-    """Run some of the subscribers until the pipeline ends."""
+def _receive(count: int, is_slow: bool, channel: str, address: Address, pipe: Connection, parent: int) -> None:
+    """Run some of the subscribers until the pipeline ends or the load test asks for their receipts; send these.
+
+    A receipt of each frame has its number and time. The messages about all objects in a frame have the same number.
+    """
     die_with(parent)
-    endpoint, gaps, last = address.resolve(), [GapCounter() for _ in numbers], [-1] * len(numbers)
+    receipts, gaps = [(array("l"), array("d")) for _ in range(count)], [GapCounter() for _ in range(count)]
+    endpoint, running, is_connected = address.resolve(), set(range(count)), False
     with ExitStack() as stack, DefaultSelector() as selector:
-        for index in range(len(numbers)):
+        for index in range(count):
             subscriber = stack.enter_context(Subscriber[Any](PUBLIC[channel], endpoint))
             selector.register(subscriber.fileno(), EVENT_READ, (index, subscriber))
-        while subscribers := selector.get_map():
+        subscribers = [*selector.get_map().values()]
+        selector.register(pipe, EVENT_READ)
+        while running and not pipe.poll():
             # Step 1: wait for messages. A slow subscriber reads one message, which need not be new, in each pause.
             if is_slow:
                 sleep(_SLOW_SECONDS)
-            ready = [*subscribers.values()] if is_slow else [key for key, _ in selector.select()]
-            for key in ready:
+            for key in subscribers if is_slow else [key for key, _ in selector.select() if key.data]:
                 index, subscriber = key.data
-                while (message := subscriber.receive(0)) is not None:
-                    # Step 2: count frames. The messages about all objects in a frame have the same number.
-                    moment, number = monotonic(), numbers[index]
+                while index in running and (message := subscriber.receive(0)) is not None:
+                    # Step 2: record the first message of each frame.
+                    frames, moments = receipts[index]
                     if isinstance(message, End):
                         gaps[index].end(message)
+                        running.discard(index)
                         selector.unregister(key.fileobj)
-                    elif message.frame != last[index]:
-                        last[index] = message.frame
-                        record.received[number] += 1
+                    elif message.frame not in frames[-1:]:
+                        frames.append(message.frame)
+                        moments.append(monotonic())
                         if isinstance(message, Track | Features):
                             gaps[index].take(message)
-                        # Step 3: record the receipt; a restarted detector may repeat a frame, or reuse its number.
-                        column = message.frame - record.begin.value
-                        if not is_slow and 0 <= column < record.frames:
-                            record.moments[number * record.frames + column] = moment
-                    record.missed[number] = gaps[index].missed
-                    if is_slow or isinstance(message, End):
+                    if is_slow:
                         break
+            if not is_connected and all(frames for frames, _ in receipts):
+                pipe.send(None)
+                is_connected = True
+    pipe.send([(receipt, gap.missed) for receipt, gap in zip(receipts, gaps, strict=True)])

@@ -64,6 +64,7 @@ def test_recording_is_compared_with_an_unloaded_run(succeed, demo_video, tmp_pat
     ("arguments", "message"),
     [
         (["--size", "640"], "a size is WIDTHxHEIGHT"),
+        (["--limit", "subscriber-p99=1"], "requires fast ones: raise --subscribers"),
         (["--limit", "p98=1"], "a limit is NAME=VALUE with one of p50"),
         (["--report", "/dev/null/load.html"], "cannot write"),
         (["--set", "run.lockstep=true"], "omit run.lockstep"),
