@@ -30,8 +30,8 @@ from table import Cell, Table, benchmark, command
 from catstream.coreset.checkpoint_store import CheckpointStore
 from catstream.coreset.forest import Forest
 from catstream.measure.camera import Camera, Schedule
-from catstream.measure.load import render
 from catstream.measure.load_result import Plan
+from catstream.measure.load_video import prepare
 from catstream.multi import MultiTracker
 from catstream.processes.decisions import sync_interval
 from catstream.processes.state import CHECKPOINTS
@@ -54,7 +54,7 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
 def camera(objects: int, seconds: float) -> tuple[Cell, ...]:
     """Track objects of a live source with --output and --state, and return a row of figures."""
     plan = Plan(objects=objects, size=(640, 480), duration=min(seconds, 48))
-    video = render(plan, lambda *_: None)
+    video = prepare(plan, plan.frames, lambda *_: None)
     boxes = [word for name, box in video.boxes.items() for word in ("--box", f"{name or 'object'}={box}")]
     with TemporaryDirectory(prefix="catstream-writes-") as place, Camera("mjpeg", plan.size, video.units) as source:
         state, out = Path(place, "state"), Path(place, "out")
@@ -79,7 +79,7 @@ def growth(objects: int, marks: list[int]) -> Iterator[tuple[Cell, ...]]:
     A second has 25 frames, however long they take.
     """
     tracker, plan = MultiTracker(), Plan(objects=objects, size=(640, 480), duration=min(marks[-1] / 25, 10))
-    video = render(plan, lambda *_: None)
+    video = prepare(plan, plan.frames, lambda *_: None)
     with patch.object(Forest, "take", autospec=True, side_effect=Forest.take) as take:
         for number, unit in enumerate(video.units):
             image = cv2.imdecode(np.frombuffer(unit, np.uint8), cv2.IMREAD_COLOR)

@@ -50,7 +50,7 @@ def run(plan: Plan, video: Video, report: Report) -> Result:
         try:
             for now in _until_the_last_track(plan, streams, observations, schedules):
                 if now >= next_reading:
-                    next_reading += _READING_SECONDS
+                    next_reading = now + _READING_SECONDS
                     usage.read(processes())
                 passed = (now - schedules[0].start) / plan.duration
                 tracks = f"{sum(len(stream.tracks) for stream in observations)} tracks"
