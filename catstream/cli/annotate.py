@@ -168,7 +168,7 @@ def _serve(
     check_distinct(zip((f"the results of {video}" for video in names), folders, strict=True), VideoError)
 
     # Step 2: Each video is opened when the page first shows it, and continues with its saved boxes.
-    context, results = click.get_current_context(), dict[int, _ResultFiles]()
+    context = click.get_current_context()
 
     def start(number: int) -> Session:
         annotation = Annotation(videos[number], {}, settings, jobs=jobs + 1)
@@ -182,7 +182,6 @@ def _serve(
         except BaseException:
             annotation.close()
             raise
-        results[number] = files
         return Session(annotation, jobs, files.save, files.write)
 
     shares = [_share(folder / f"{name}.csv") for folder, name in zip(folders, names.values(), strict=True)]
@@ -194,17 +193,18 @@ def _serve(
                 session.write()
 
     # Step 3: Report each of them.
-    for number, session in enumerate(sessions):
+    opened = sorted(sessions.opened.items())
+    for number, session in opened:
         if several:
             click.echo(f"{session.annotation.frames.name}:")
         _report(session.annotation)
         if not interrupted or session.annotation.keyframes:
-            click.echo(f"results: {sorted(results.items())[number][1].folder}")
-    for session in sessions:
+            click.echo(f"results: {folders[number]}")
+    for _, session in opened:
         if session.problem is not None:
             raise session.problem
     if interrupted:
-        drawn = any(session.annotation.keyframes for session in sessions)
+        drawn = any(session.annotation.keyframes for _, session in opened)
         stopped("the results so far are saved; the same command continues" if drawn else "")
 
 
@@ -302,7 +302,7 @@ def _report(annotation: Annotation) -> None:
     """Print how many frames of each object are checked, and the frame to look at next."""
     from catstream.video.frames import describe_counters
 
-    for line in describe_counters(annotation.counters):
+    for line in describe_counters(annotation.frames.counters):
         click.echo(line)
     for name, checks in annotation.checked.items():
         count = len(checks) - checks.count("unchecked")

@@ -103,7 +103,6 @@ class Annotation:
     frames : VideoFrames
     keyframes : dict of the boxes of each object, by name and frame
     stored : file of finished passes, see `save_passes`; `scan` reads it. None without one
-    counters : counters of the video by name, see `catstream.video.frames.describe_counters`
     progress : as of the parameters
 
     Raises
@@ -186,10 +185,6 @@ class Annotation:
         self._drawn = {
             name: {frame: box for frame, box in boxes.items() if box != HIDDEN} for name, boxes in parsed.items()
         }
-
-    @property
-    def counters(self) -> dict[str, float]:
-        return self.frames.counters
 
     def scan(self, *, exact: bool = False) -> None:
         """Number the frames, if they are not yet; `exact` as of `VideoFrames.scan`.

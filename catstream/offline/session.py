@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from pathlib import Path
 from typing import Any, Self
@@ -94,8 +94,7 @@ class Session:
             before = self.annotation.keyframes
             self._newest[object] = frame
             self._turns.pop(object, None)
-            self._replace({**before, object: {**before.get(object, {}), frame: box}})
-            self._history.append((object, frame, before))
+            self._change({**before, object: {**before.get(object, {}), frame: box}}, object, frame)
 
     def delete(self, object: str, frame: int | None = None) -> None:
         """Delete the box of an object at a frame; without a frame, or with its last box, delete the object."""
@@ -106,8 +105,7 @@ class Session:
             if not any(isinstance(box, Box) for box in boxes.values()):
                 after.pop(object, None)
             if after != before:
-                self._replace(after)
-                self._history.append((object, frame, before))
+                self._change(after, object, frame)
 
     def rename(self, object: str, name: str) -> None:
         """Rename an object, which keeps its passes; ObjectError if there is another object with this name."""
@@ -117,8 +115,7 @@ class Session:
                 return
             if name in before:
                 raise ObjectError(f"there is an object {name} already: use another name")
-            self._replace({name if other == object else other: drawn for other, drawn in before.items()})
-            self._history.append((object, None, before))
+            self._change({name if other == object else other: drawn for other, drawn in before.items()}, object, None)
 
     def undo(self) -> tuple[str, int | None] | None:
         """Undo the last change; return its object, and the frame of its box. None if there is none."""
@@ -154,6 +151,12 @@ class Session:
         with self.lock:
             tracked = {task: count.stat().st_size for task, count in self._running.values()}
             return max(int(self._wakes), sum(max(1, task.frames - tracked.get(task, 0)) for task in self._missing))
+
+    def _change(self, keyframes: dict[str, dict[int, KeyframeBox]], object: str, frame: int | None) -> None:
+        """Replace the boxes, which `undo` brings back."""
+        before = self.annotation.keyframes
+        self._replace(keyframes)
+        self._history.append((object, frame, before))
 
     def _replace(self, keyframes: dict[str, dict[int, KeyframeBox]]) -> None:
         if self.finished.is_set():
@@ -241,14 +244,15 @@ class Session:
 
     def _next_task(self) -> Task | None:
         """The missing pass that starts next: the shortest at the newest box of the object whose turn it is."""
+
+        def order(task: Task) -> tuple[int, bool, int]:
+            is_newest = self._newest.get(task.object) in (task.start, task.stop)
+            return self._turns.get(task.object, 0), not is_newest, task.frames
+
         running = [task for task, _ in self._running.values()]
         limit = _LONG if sum(task.frames > _LONG for task in running) >= self._jobs else sys.maxsize
         waiting = [task for task in self._missing if task not in running and task.frames <= limit]
-        return min(waiting, key=self._priority) if waiting and len(running) <= self._jobs else None
-
-    def _priority(self, task: Task) -> tuple[int, bool, int]:
-        is_newest = self._newest.get(task.object) in (task.start, task.stop)
-        return self._turns.get(task.object, 0), not is_newest, task.frames
+        return min(waiting, key=order) if waiting and len(running) <= self._jobs else None
 
     def _is_tracked(self, following: NextFrame) -> bool:
         """Return True if a missing pass may check the frame soon: none can at an end of the video without a box."""
@@ -275,33 +279,27 @@ class Sessions:
     ----------
     names, shares : as of the parameters
     number : number of the open video
+    opened : sessions of the videos that were opened, by number
     """
 
     def __init__(self, names: Sequence[str], start: Callable[[int], Session], shares: Sequence[float]) -> None:
         self.names, self.shares, self.number = names, [*shares], 0
         self._start, self._lock = start, threading.Lock()
-        self._sessions: dict[int, Session] = {}
+        self.opened: dict[int, Session] = {}
 
     def __enter__(self) -> Self:
-        self._sessions[0] = self._start(0).__enter__()
+        self.opened[0] = self._start(0).__enter__()
         return self
 
     def __exit__(self, *_: object) -> None:
         self.current.__exit__()
-        for session in self._sessions.values():
+        for session in self.opened.values():
             session.annotation.close()
-
-    def __iter__(self) -> Iterator[Session]:
-        """The sessions of the videos that were opened, in their order."""
-        return (self._sessions[number] for number in sorted(self._sessions))
 
     @property
     def current(self) -> Session:
         """The session of the open video."""
-        return self[self.number]
-
-    def __getitem__(self, number: int) -> Session:
-        return self._sessions[number]
+        return self.opened[self.number]
 
     def open(self, number: int) -> None:
         """Open another video, and write the results of the previous one; VideoError if either fails."""
@@ -309,7 +307,7 @@ class Sessions:
             before = self.current
             if number == self.number or before.finished.is_set():
                 return
-            session = self._sessions.get(number) or self._start(number)
+            session = self.opened.get(number) or self._start(number)
             before.__exit__()
             try:
                 if before.decoded and (before.annotation.keyframes or before.can_undo):
@@ -317,5 +315,5 @@ class Sessions:
                     before.write()
             finally:
                 session.revision += before.revision + 1  # it never decreases for the page
-                self._sessions[number] = session.__enter__()
+                self.opened[number] = session.__enter__()
                 self.number = number

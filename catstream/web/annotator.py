@@ -132,7 +132,8 @@ class AnnotationSite:
 
     def _state(self) -> dict[str, object]:
         number = self._sessions.number
-        session, frames = self._sessions[number], self._sessions[number].annotation.frames
+        session = self._sessions.opened[number]
+        frames = session.annotation.frames
         with session.lock:
             state = (session.revision, len(frames))
             if state != self._objects_state:
@@ -148,7 +149,7 @@ class AnnotationSite:
             "remaining": session.remaining(),
             "revision": session.revision,
             "undo": session.can_undo,
-            "problem": str(session.problem or ", ".join(describe_counters(session.annotation.counters))),
+            "problem": str(session.problem or ", ".join(describe_counters(frames.counters))),
         }
 
 
