@@ -43,8 +43,6 @@ class AnnotationSite:
 
     def __init__(self, sessions: Sessions) -> None:
         self._sessions, self._closed = sessions, False
-        self._objects_state: tuple[int, int] | None = None  # of which `_objects` are
-        self._objects: list[dict[str, object]] = []
         self._id = token_hex(8)  # a tab of an earlier server at the same port has another one
         routes = [
             Route("/", lambda _: FileResponse(PAGE / "annotate.html")),
@@ -133,24 +131,20 @@ class AnnotationSite:
     def _state(self) -> dict[str, object]:
         number = self._sessions.number
         session = self._sessions.opened[number]
-        frames = session.annotation.frames
         with session.lock:
-            state = (session.revision, len(frames))
-            if state != self._objects_state:
-                self._objects_state, self._objects = state, _described(session)
-        return {
-            "server": self._id,
-            "video": number,
-            "videos": [*zip(self._sessions.names, self._sessions.shares, strict=True)],
-            "frames": len(frames),
-            "decoded": session.decoded,
-            "objects": self._objects,
-            "next": [*session.next_frames[:99]],
-            "remaining": session.remaining(),
-            "revision": session.revision,
-            "undo": session.can_undo,
-            "problem": str(session.problem or ", ".join(describe_counters(frames.counters))),
-        }
+            return {
+                "server": self._id,
+                "video": number,
+                "videos": [*zip(self._sessions.names, self._sessions.shares, strict=True)],
+                "frames": len(session.annotation.frames),
+                "decoded": session.decoded,
+                "objects": _described(session),
+                "next": [*session.next_frames[:99]],
+                "remaining": session.remaining(),
+                "revision": session.revision,
+                "undo": session.can_undo,
+                "problem": str(session.problem or ", ".join(describe_counters(session.annotation.frames.counters))),
+            }
 
 
 @dataclass(frozen=True, slots=True)
