@@ -136,9 +136,9 @@ class AnnotatePage {
         continue;
       }
       const { size: [width, height], objects } = answer;
-      this.boxes = objects;
       const shown = this.stage.picture?.frame === frame;
       if (!shown) await this.stage.show({ frame, query, width, height, boxes: {} });
+      this.boxes = objects; // with their picture, as they can be changed then
       this.showBoxes();
       if (!shown && this.stage.picture) this.stage.reveal();
       this.show();
