@@ -146,24 +146,6 @@ def test_a_subscriber_whose_end_message_was_dropped_still_ends(tracks, attached)
         assert len(heard) + subscription.missed == count - 2
 
 
-def test_a_late_subscriber_gets_the_last_model_once_and_ends_with_the_tracks(endpoint, tracks, turning):
-    seen = []
-
-    def turn():
-        models.serve_late_joiners()
-        if seen:  # the subscriber is there
-            tracks.send(End(1, "the source has ended"))
-
-    with Publisher(MODELS, endpoint) as models:
-        models.send(model(1))
-        models.send(model(2))
-        with turning(turn), catstream.subscribe(str(endpoint), "models", timeout=20) as subscription:
-            for message in subscription:
-                seen.append(message.version)
-    assert seen == [2]
-    assert subscription.end.reason == "the source has ended"
-
-
 def test_a_message_that_arrives_while_a_reader_is_suspended_at_the_end_is_read(endpoint, tracks, until, monkeypatch):
     monkeypatch.setattr("catstream.client.subscription.DRAIN_SECONDS", 0.0)
     with (
@@ -182,6 +164,7 @@ def test_a_message_that_arrives_while_a_reader_is_suspended_at_the_end_is_read(e
 
         monkeypatch.setattr(ends, "receive", late)
         assert [message.version for message in subscription] == [1]
+        assert subscription.end.reason == "the source has ended"
 
 
 def test_features_are_copied_to_all_subscribers_and_missing_ones_are_counted(endpoint, until):
