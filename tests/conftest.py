@@ -53,7 +53,7 @@ from catstream.wire.endpoint import Endpoint
 from catstream.wire.keys import allow, create
 from catstream.wire.messages import Answer, Command
 
-# No time is a pass mark, and each run has the same examples: `make fuzz` looks for others.
+# No time is a pass mark, and each run has the same examples.
 hypothesis.settings.register_profile(
     "catstream", deadline=None, derandomize=True, suppress_health_check=[hypothesis.HealthCheck.too_slow]
 )
