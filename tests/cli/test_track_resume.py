@@ -60,33 +60,46 @@ def kill_everything(process):
 
 
 @pytest.fixture(scope="module")
-def wreck(video, program, until, tmp_path_factory):
-    """What is left of a run that was killed with all its processes, as by a power cut: its place, and a copy of it."""
+def line(video, tmp_path_factory):
+    """The words of the command that the systemd unit runs, for the stream `gate` and in its folder."""
+    (start,) = (line for line in UNIT.read_text().splitlines() if line.startswith("ExecStart="))
     source, box = video
+    options = shlex.join(["--box", box, "--video", "--write", "-", *OFTEN])
+    for name, value in {
+        "%t": tmp_path_factory.mktemp("runtime"),
+        "%i": "gate",
+        "$OPTIONS": options,
+        "${SOURCE}": source,
+    }.items():
+        start = start.replace(name, str(value))
+    return shlex.split(start)[1:]
+
+
+@pytest.fixture(scope="module")
+def wreck(line, program, until, tmp_path_factory):
+    """What is left of a run that was killed with all its processes, as by a power cut: its place, and a copy of it."""
     place = tmp_path_factory.mktemp("killed") / "run"
+    place.mkdir()
     # Nobody reads its standard output: the run waits once the pipe is full, half of the frames later.
-    results = ["--output", place / "out", "--video", "--state", place / "kept", "--write", "-"]
-    command = [*program, "track", source, "--box", box, *map(str, results), *OFTEN]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, pipesize=4096)
-    kept, out = place / "kept", place / "out"
-    until(lambda: process.poll() is not None or (len(checkpoints(kept)) > 1 and len(frames(out)) >= 6))
-    assert process.poll() is None, process.communicate()[1]
-    kill_everything(process)
-    process.stdout.close()
-    process.stderr.close()
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, "pipesize": 4096}
+    with subprocess.Popen([*program, *line], cwd=place, **pipes) as process:
+        kept, out = place / "state", place / "tracks"
+        until(lambda: process.poll() is not None or (len(checkpoints(kept)) > 1 and len(frames(out)) >= 6))
+        assert process.poll() is None, process.communicate()[1]
+        kill_everything(process)
     return place, shutil.copytree(place, place.with_name("copy"))
 
 
 @pytest.fixture
 def killed(wreck):
-    """The place of a run that was killed, as it was left: its results in `out`, its state in `kept`."""
+    """The place of a run that was killed, as it was left: its results in `tracks`, its state in `state`."""
     place, copy = wreck
     shutil.rmtree(place)
     return shutil.copytree(copy, place)
 
 
 def test_a_run_whose_processes_were_all_killed_resumes_with_each_frame_once(killed, whole_run, succeed, fail, tmp_path):
-    kept, out = killed / "kept", killed / "out"
+    kept, out = killed / "state", killed / "tracks"
     before = len(frames(out))
     assert before < 32
     _, errors = succeed("track", "--resume", kept)
@@ -103,9 +116,9 @@ def test_a_run_whose_processes_were_all_killed_resumes_with_each_frame_once(kill
 
 
 def test_a_state_folder_that_is_in_use_or_has_other_settings_is_rejected(killed, video, fail, tmp_path):
-    kept, (source, box) = killed / "kept", video
+    kept, (source, box) = killed / "state", video
     refusals = {
-        "continue it": ["track", source, "--box", box, "--state", kept, "--output", killed / "out"],  # which exists
+        "continue it": ["track", source, "--box", box, "--state", kept, "--output", killed / "tracks"],  # which exists
         "started with coreset.size=64, not 32": ["track", "--resume", kept, *OFTEN, "--set", "coreset.size=32"],
         "frames 3 to the last": ["track", "--resume", kept, "--start", "3"],
         "contains no run": ["track", "--resume", tmp_path / "none"],
@@ -119,7 +132,8 @@ def test_a_state_folder_that_is_in_use_or_has_other_settings_is_rejected(killed,
     for word, command in refusals.items():
         assert word in fail(*command)
     with Pipeline(resume=kept):
-        assert "a running pipeline uses the state" in fail("track", "--resume", kept)
+        elsewhere = ["--set", f"run.endpoint={tmp_path / 'run'}"]
+        assert "a running pipeline uses the state" in fail("track", "--resume", kept, *elsewhere)
 
 
 def test_settings_that_are_given_again_change_and_all_others_stay(video, said, succeed, monkeypatch, tmp_path):
@@ -156,29 +170,14 @@ def test_a_complete_run_gets_no_further_rows_but_the_files_that_it_lacks(video, 
         assert annotated.frames == 6
 
 
-def test_a_run_that_was_killed_continues_by_the_line_of_the_service_that_began_it(
-    video, whole_run, program, succeed, until, tmp_path
-):
-    (source, box), kept, out = video, tmp_path / "state", tmp_path / "tracks"
-    (line,) = (
-        line.removeprefix("ExecStart=") for line in UNIT.read_text().splitlines() if line.startswith("ExecStart=")
-    )
-    options = shlex.join(["--box", box, "--write", "-", *OFTEN])
-    for name, value in {"%t": tmp_path, "%i": "gate", "$OPTIONS": options, "${SOURCE}": source}.items():
-        line = line.replace(name, str(value))
-    _, *words = shlex.split(line)
-    # Nobody reads the standard output, as above.
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, "pipesize": 4096}
-    with subprocess.Popen([*program, *words], cwd=tmp_path, **pipes) as process:
-        until(lambda: process.poll() is not None or (checkpoints(kept) and len(frames(out)) >= 3))
-        assert process.poll() is None, process.stderr.read()
-        kill_everything(process)
-    before = len(frames(out))
+def test_killed_service_continues_by_the_command_that_began_it(killed, line, whole_run, succeed):
+    log = killed / "tracks" / "demo.ndjson"
+    before = len(frames(log.parent))
     for says in ("present in", "is complete: to track the source again"):
-        _, errors = succeed(*words, cwd=tmp_path)
+        _, errors = succeed(*line, cwd=killed)
         assert "the resumed run in state keeps its objects" in errors
         assert says in errors
-        assert_goes_on(out / "demo.ndjson", before, whole_run / "out" / "demo.ndjson")
+        assert_goes_on(log, before, whole_run / "out" / "demo.ndjson")
 
 
 @pytest.mark.skipif(not shutil.which("systemd-analyze"), reason="no systemd-analyze: apt-get install systemd")
@@ -191,18 +190,12 @@ def test_systemd_finds_nothing_wrong_in_a_unit(tmp_path, name):
     assert (checked.returncode, checked.stderr) == (0, "")
 
 
-def test_new_results_of_a_resumed_run_have_all_frames_also_after_its_end(killed, succeed):
-    succeed("track", "--resume", killed / "kept")
-    succeed("track", "--resume", killed / "kept", "--output", killed / "new")
-    assert frames(killed / "new") == [*range(32)]
-
-
-def test_a_resumed_run_drops_a_video_and_files_if_it_is_told_so(killed, succeed):
-    kept, first, second = killed / "kept", killed / "first.csv", killed / "second.csv"
-    succeed("track", "--resume", kept, "--write", first)
-    assert Job.load(kept).results.write == (first,)
-    first.unlink()
-    succeed("track", "--resume", kept, "--no-video", "--write", second)
+def test_resumed_run_writes_fewer_files_if_it_is_told_so(killed, succeed):
+    kept, (csv, other), new = killed / "state", (killed / name for name in ("a.csv", "b.csv")), killed / "new"
+    succeed("track", "--resume", kept, "--write", csv, "--write", other)
+    before = other.read_bytes()
+    succeed("track", "--resume", kept, "--no-video", "--write", csv, "--output", new)
     results = Job.load(kept).results
-    assert (results.output, results.video, results.write) == (killed / "out", False, (second,))
-    assert (first.exists(), second.exists()) == (False, True)
+    assert (results.output, results.video, results.write) == (new, False, (csv,))
+    assert (other.read_bytes(), sorted(file.name for file in new.iterdir())) == (before, ["demo.csv", "demo.ndjson"])
+    assert frames(new) == [*range(32)]
