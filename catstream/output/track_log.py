@@ -282,8 +282,11 @@ class Log:
         self.damaged = self.gap = 0
         if not self.path.exists():
             return
-        (start, parse), end, problem, is_cut = self._parser(), 0, "", False
         with self.path.open("rb") as file:
+            if self.path.suffix == ".csv" and not file.readline().endswith(b"\n"):  # a crash has cut the names
+                return
+            file.seek(0)
+            (start, parse), end, problem, is_cut = self._parser(), 0, "", False
             for number, line in enumerate(file, 1):
                 end += len(line)
                 if number <= start:
