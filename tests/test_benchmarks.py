@@ -16,8 +16,8 @@ from catstream.measure.datasets import Sequence, find_sequences
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 sys.path.append(str(BENCHMARKS))
 
-from accuracy import TrackerRun, is_lost, rows_of  # noqa: E402
-from starts import Start, jittered, one_pass, spatial, temporal  # noqa: E402
+from accuracy import is_lost  # noqa: E402
+from starts import jittered, spatial  # noqa: E402
 
 NO_BENCHMARKS = {BENCHMARKS / "page.py", BENCHMARKS / "provenance.py"}
 SLOW = BENCHMARKS / "fleet" / "faults.py"  # minutes; tests/fleet/test_fleet.py kills a node, too
@@ -47,17 +47,6 @@ def sequence(walk) -> Sequence:
     return find_sequences(walk)[0]
 
 
-def test_temporal_starts_are_evenly_spaced_frames_with_a_usable_box(sequence):
-    def frames(count: int) -> list[int]:
-        return [start.frame for start in temporal(count)(sequence)]
-
-    assert (frames(1), frames(2), frames(4)) == ([0], [0, 8], [0, 3, 8, 9])  # the object is absent in 5, 6 and 7
-    boxes = sequence.boxes.copy()
-    boxes[[0, 3]] = (-99, 0, 330, 90)
-    sequence = replace(sequence, boxes=boxes)
-    assert frames(4) == [1, 4, 8, 9]
-
-
 def test_spatial_starts_are_those_of_cvpr2013_and_jitter_is_within_two_percent(sequence):
     x, y, w, h = sequence.boxes[0]
     boxes = np.array([start.box(sequence) for start in spatial(sequence)])
@@ -71,21 +60,6 @@ def test_spatial_starts_are_those_of_cvpr2013_and_jitter_is_within_two_percent(s
         assert max(abs(np.subtract(box, first) / (w, h, w, h))) <= 0.03
     late = replace(sequence, boxes=np.vstack([np.full((3, 4), np.nan), sequence.boxes]))
     assert {start.suffix for start in spatial(late)} > {"@3-left", "@3-size-0.8"}
-
-
-def test_rows_have_means_and_spreads_of_the_runs_and_flip_if_the_first_box_decides(sequence):
-    def run(kept: int, start: Start) -> TrackerRun:
-        boxes = np.where(np.arange(12)[:, None] < kept, sequence.boxes, np.nan)
-        return TrackerRun(sequence, boxes, np.full(12, 0.02), "catstream", start)
-
-    starts = jittered(2)(sequence)
-    (flipping,), (steady,), (plain,) = (rows_of(map(run, kept, starts)) for kept in ((12, 9), (12, 10), (12,)))
-    assert (flipping.flips, steady.flips, plain.flips) == (True, False, None)  # 0.33 and 0.22 of nine frames are lost
-    assert (flipping.runs, flipping.absent, flipping.present, flipping.false) == (2, 6, 18, 3)
-    assert flipping.success == pytest.approx((1 + 6 / 9) / 2)
-    assert flipping.success_spread == pytest.approx((1 - 6 / 9) / 2)
-    assert plain.fps == pytest.approx(50)
-    assert one_pass(sequence) == starts[:1]
 
 
 @pytest.mark.parametrize(

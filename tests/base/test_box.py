@@ -18,13 +18,26 @@ def test_a_box_is_parsed_from_a_text_and_from_any_four_numbers(value):
 
 
 @pytest.mark.parametrize(
-    "value", ["10,20,30", "a,b,c,d", "", (10, 20, 30), [[10, 20], [30, 40]], None, 7, (10, 20, None, 40)], ids=repr
+    "value",
+    [
+        "10,20,30",
+        "a,b,c,d",
+        "",
+        (10, 20, 30),
+        [[1, 2], [3, 4]],
+        None,
+        7,
+        (10, 20, None, 40),
+        np.zeros((480, 640, 3)),
+    ],
+    ids=lambda value: repr(value)[:9],
 )
 def test_anything_but_four_numbers_is_one_line_of_error_with_an_example(value):
     said = r"a box is four numbers x,y,w,h in pixels, got .*: for example 120,80,64,48"
     with pytest.raises(BoxError, match=said) as told:
         Box.parse(value)
     assert "\n" not in str(told.value)
+    assert len(str(told.value)) < 200
 
 
 def test_cv2_draws_a_rounded_box():
@@ -32,9 +45,3 @@ def test_cv2_draws_a_rounded_box():
     cv2.rectangle(frame, Box(10.4, 19.6, 30.4, 10.2).rounded(), (255, 255, 255), cv2.FILLED)
     rows, columns = np.nonzero(frame[:, :, 0])
     assert (columns.min(), rows.min(), columns.max() + 1, rows.max() + 1) == (10, 20, 41, 30)
-
-
-def test_a_long_text_is_shortened_in_the_error():
-    with pytest.raises(BoxError) as told:
-        Box.parse(np.zeros((480, 640, 3)))
-    assert len(str(told.value)) < 200

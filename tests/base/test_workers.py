@@ -43,13 +43,6 @@ def test_a_caller_that_stops_early_leaves_no_worker():
     assert not multiprocessing.active_children()
 
 
-def test_workers_remain_between_tasks_and_end_when_they_are_closed():
-    with closing(Workers(1)) as workers:
-        first, second = ([*workers.run(os.getpid, [()])] for _ in range(2))
-        assert first == second != [os.getpid()]
-    assert not multiprocessing.active_children()
-
-
 def test_workers_are_started_again_after_a_caller_stopped_early():
     with closing(Workers(1)) as workers:
         stopped = workers.run(os.getpid, [(), ()])
@@ -58,11 +51,12 @@ def test_workers_are_started_again_after_a_caller_stopped_early():
         assert [*workers.run(os.getpid, [()])] != [first]
 
 
-def test_workers_outlive_the_thread_that_started_them():
+def test_workers_outlive_the_thread_that_started_them_until_closed():
     with closing(Workers(1)) as workers:
         with ThreadPoolExecutor(1) as thread:
             first = thread.submit(lambda: [*workers.run(os.getpid, [()])]).result()
-        assert [*workers.run(os.getpid, [()])] == first
+        assert [*workers.run(os.getpid, [()])] == first != [os.getpid()]
+    assert not multiprocessing.active_children()
 
 
 def test_workers_end_with_a_process_that_is_killed(alive, until):

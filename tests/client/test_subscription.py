@@ -12,7 +12,7 @@ import zmq
 import catstream
 from catstream.errors import ObjectError, ServiceError, SilenceError
 from catstream.wire import socket
-from catstream.wire.channels import FEATURES, HEALTH, MODELS, TRACKS
+from catstream.wire.channels import HEALTH, MODELS, TRACKS
 from catstream.wire.discovery import reserve_endpoint
 from catstream.wire.messages import End, Features, Health, ObjectFeatures, TrainingRows
 from catstream.wire.newest import Publisher
@@ -165,23 +165,6 @@ def test_a_message_that_arrives_while_a_reader_is_suspended_at_the_end_is_read(e
         monkeypatch.setattr(ends, "receive", late)
         assert [message.version for message in subscription] == [1]
         assert subscription.end.reason == "the source has ended"
-
-
-def test_features_are_copied_to_all_subscribers_and_missing_ones_are_counted(endpoint, until):
-    with (
-        Publisher(FEATURES, endpoint) as training,
-        catstream.subscribe(str(endpoint), "features", timeout=0.05) as subscription,
-    ):
-        until(lambda: training.has_subscribers, training.serve_late_joiners)
-        for seq in (3, 4, 7):
-            training.send(features(seq))
-        training.send(End(8, "the source has ended"))
-        subscription.timeout = 20
-        heard = list(subscription)
-    assert [message.seq for message in heard] == [3, 4, 7]
-    assert (heard[0].objects[""].training["appearance"].rows == 3).all()
-    assert subscription.missed == 2 + 2 + 1
-    assert subscription.losses() == "5 missed, 2 of them before this subscriber connected"
 
 
 def test_iteration_may_continue_after_a_timeout_and_the_end_counts_missed_frames(endpoint, tracks, until):

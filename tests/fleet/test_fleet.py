@@ -17,7 +17,7 @@ import pytest
 
 import catstream
 from catstream.client.registry import Registry
-from catstream.errors import ServiceError, StoreError
+from catstream.errors import ServiceError
 from catstream.fleet import fleet as module
 from catstream.fleet.controller import nodes
 from catstream.fleet.fleet import _VARIABLES, Fleet
@@ -152,14 +152,6 @@ def test_a_second_up_changes_a_fleet_that_runs_and_down_ends_it_from_elsewhere(f
         assert "the fleet other was ended from elsewhere" in up.communicate(timeout=150)[0]
     assert up.returncode == 0
     assert "no fleet 'other' of yours runs" in run("fleet", "down", "--name", "other").stderr
-
-
-def test_a_store_that_cannot_be_used_is_said_before_anything_starts(home, tmp_path):
-    (tmp_path / "file").write_text("")
-    spec = FleetSpec("nowhere", str(tmp_path / "file" / "store"), streams={"a": StreamSpec("a", LIVE)})
-    with pytest.raises(StoreError, match="cannot be created"):
-        Fleet(spec).up()
-    assert not (home / "nowhere").exists()
 
 
 # On a cluster.

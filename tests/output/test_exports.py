@@ -12,7 +12,7 @@ from pycocotools.coco import COCO
 from catstream.base.box import Box
 from catstream.errors import VideoError
 from catstream.output.annotations import About
-from catstream.output.destinations import Header, Origin, TrackedFrame, open_sink
+from catstream.output.destinations import Header, TrackedFrame
 from catstream.output.exports import export, export_of
 from catstream.output.track_log import Log
 from catstream.wire.messages import Track
@@ -226,8 +226,3 @@ def test_a_csv_file_is_made_from_other_logs(tmp_path):
     log = [TrackedFrame([present(frame, "anna"), present(frame, "", None)], 0.5) for frame in range(2)]
     read = Log(made(tmp_path / "t.csv", log=log))
     assert [track.box for frame in read for track in frame.tracks] == [BOX, None] * 2
-
-
-def test_an_export_is_no_sink(tmp_path):
-    with pytest.raises(VideoError, match="use catstream export"):
-        open_sink(str(tmp_path / "t.json"), Origin())

@@ -8,8 +8,9 @@ import socket
 import subprocess
 import sys
 import threading
-from contextlib import ExitStack, closing, contextmanager, suppress
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import replace
+from socketserver import BaseRequestHandler, TCPServer
 
 import paho.mqtt.client as mqtt
 import pytest
@@ -266,21 +267,17 @@ def test_a_broker_that_never_answers_holds_nothing_up_and_what_it_misses_is_coun
 @contextmanager
 def answering(reply):
     """A server that answers each connection with some bytes, and closes it; yields its port, and the connections."""
+
+    class Handler(BaseRequestHandler):
+        def handle(self):
+            connections.append(self.request.recv(1024))  # all: a reply before a reset would be lost
+            self.request.sendall(reply)
+
     connections = []
-    with socket.create_server(("127.0.0.1", 0)) as server, suppress(OSError):
-
-        def serve():
-            with suppress(OSError):
-                while True:
-                    connection, _ = server.accept()
-                    connections.append(connection)
-                    with connection:
-                        connection.recv(1024)  # all: a reply before a reset would be lost
-                        connection.sendall(reply)
-
-        threading.Thread(target=serve, daemon=True).start()
-        yield server.getsockname()[1], connections
-        server.shutdown(socket.SHUT_RDWR)
+    with TCPServer(("127.0.0.1", 0), Handler) as server:
+        threading.Thread(target=server.serve_forever, args=(0.02,), daemon=True).start()
+        yield server.server_address[1], connections
+        server.shutdown()
 
 
 CLOSED, HTTP, SSH = b"", b"HTTP/1.1 400 Bad Request\r\n\r\n", b"SSH-2.0-OpenSSH_9.2\r\n"
