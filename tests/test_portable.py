@@ -11,7 +11,7 @@ from catstream.errors import ServiceError
 
 #: Takes away what Windows or macOS lack, before anything is imported, and then runs this half.
 PROGRAM = """
-import ctypes, os, signal, socket, sys
+import ctypes, os, select, signal, socket, subprocess, sys
 
 class Missing:
     def find_spec(self, name, path=None, target=None):
@@ -24,11 +24,12 @@ for name in ("fcntl", "grp", "pwd", "resource", "termios"):
     sys.modules.pop(name, None)
 for module, names in {
     os: (
-        *("O_DIRECTORY", "O_NONBLOCK", "fork", "geteuid", "getuid"),
-        *("memfd_create", "register_at_fork", "sched_getaffinity", "sysconf"),
+        *("O_CLOEXEC", "O_DIRECTORY", "O_NONBLOCK", "fork", "geteuid", "getuid", "memfd_create", "nice"),
+        *("pidfd_open", "pread", "register_at_fork", "sched_getaffinity", "sysconf"),
     ),
-    signal: ("SIGHUP", "SIGSTOP", "pthread_sigmask"),
-    socket: ("AF_UNIX",),
+    select: ("poll",),
+    signal: ("SIGCHLD", "SIGHUP", "SIGSTOP", "pthread_sigmask"),
+    socket: ("AF_UNIX", "recv_fds", "send_fds"),
 }.items():
     for name in names:
         delattr(module, name)
@@ -67,7 +68,10 @@ if __name__ == "__main__":
     run("find", "--model", "anna.safetensors", video, walk)
     run("find", "--model", "anna.safetensors", "rtsp://anna:secret@camera/", code=1)
     run("evaluate", walk, "--report", "accuracy.html")
-    tree = catstream.CoresetTree(2)
+    run("demo", "--frames", "3")
+    run("settings")
+    run("merge", "anna.safetensors", "anna.safetensors", "--output", "both", code=1)
+    catstream.CoresetTree(2)
     print("all ran")
 """
 
