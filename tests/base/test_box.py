@@ -19,17 +19,7 @@ def test_a_box_is_parsed_from_a_text_and_from_any_four_numbers(value):
 
 @pytest.mark.parametrize(
     "value",
-    [
-        "10,20,30",
-        "a,b,c,d",
-        "",
-        (10, 20, 30),
-        [[1, 2], [3, 4]],
-        None,
-        7,
-        (10, 20, None, 40),
-        np.zeros((480, 640, 3)),
-    ],
+    ["10,20,30", "a,b,c,d", "", (10, 20, 30), [[1, 2], [3, 4]], None, 7, (10, 20, None, 40), np.zeros((480, 640, 3))],
     ids=lambda value: repr(value)[:9],
 )
 def test_anything_but_four_numbers_is_one_line_of_error_with_an_example(value):

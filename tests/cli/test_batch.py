@@ -1,10 +1,8 @@
 """`catstream batch`: the logs of many videos, what is not tracked again, and one data set of all."""
 
 import csv
-import os
 import signal
 from dataclasses import replace
-from pathlib import Path
 
 import psutil
 import pytest
@@ -101,14 +99,6 @@ def test_results_of_another_table_are_not_replaced_and_its_rows_stay(demo, batch
     other = table(tmp_path / "three", f"two/cam.mp4,anna,{demo[0]},")
     succeed("batch", other, *words, "--overwrite")
     assert Log(tmp_path / "out" / "two_cam.ndjson").header().source == f"{tmp_path}/three/two/cam.mp4"
-
-
-@pytest.mark.parametrize("spoil", [Path.unlink, lambda log: os.truncate(log, 0)], ids=["removed", "emptied"])
-def test_a_video_whose_log_was_removed_or_emptied_is_tracked_again(demo, batch, tmp_path, spoil):
-    batch(f"two/cam.mp4,anna,{demo[0]},")
-    spoil(tmp_path / "out" / "two_cam.ndjson")
-    batch(f"./two/cam.mp4,anna,{demo[0]},")
-    assert sum(1 for _ in Log(tmp_path / "out" / "two_cam.ndjson")) == FRAMES
 
 
 def test_an_object_with_one_box_has_the_same_tracks_beside_one_with_several(demo, batch, tmp_path):

@@ -97,12 +97,7 @@ def test_words_select_settings_by_name_and_description(said):
 
 @pytest.mark.parametrize(
     ("words", "meant"),
-    [
-        (["trak"], "track"),
-        (["set_box"], "set-box"),
-        (["fleet", "staus"], "status"),
-        (["keys", "alow"], "allow"),
-    ],
+    [(["trak"], "track"), (["set_box"], "set-box"), (["fleet", "staus"], "status"), (["keys", "alow"], "allow")],
 )
 def test_nearest_command_is_suggested_for_a_mistyped_one(fail, words, meant):
     assert fail(*words).endswith(f"Did you mean {meant!r}?")

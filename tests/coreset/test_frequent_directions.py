@@ -52,11 +52,6 @@ def test_two_sketches_merged_are_one_sketch_within_the_bound(stream):
     assert_within_the_bound(sketch, stream)
 
 
-def test_a_rank_below_n_loses_nothing(rng):
-    rows = (rng.normal(size=(20 * SIZE, SIZE)) @ rng.normal(size=(SIZE, 60))).astype(np.float32)
-    assert_allclose(sketched(rows).dropped_energy, 0, atol=ROUNDING * energy(rows))
-
-
 def test_memory_does_not_grow_with_the_rows(rng):
     sketch, sizes = FrequentDirections(4), set()
     for _ in range(300):

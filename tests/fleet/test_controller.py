@@ -248,10 +248,7 @@ def test_a_change_that_cannot_be_stored_is_refused_and_not_done(site, monkeypatc
 
     with monkeypatch.context() as patch:
         patch.setattr(StateStore, "put", fails)
-        for change in (
-            lambda: site.add(replace(GATE, name="new"), {}),
-            lambda: site.remove(("gate",)),
-        ):
+        for change in (lambda: site.add(replace(GATE, name="new"), {}), lambda: site.remove(("gate",))):
             with pytest.raises(StoreError, match="cannot be reached"):
                 change()
     assert sorted(site.status().streams) == ["gate", "roof"]

@@ -117,7 +117,6 @@ def test_the_digest_changes_exactly_if_the_stream_must_be_started_anew(change, r
         ("[streams]\ncam-7 = 3", "the stream cam-7: expected a table with a source, got 3: write [streams.cam-7]"),
         ('[streams."cam 7"]\nsource="0"', "'cam 7' is not a valid name of a stream: expected 1 to 64 letters"),
         ('naem="a"\n[streams.a]\nsource="0"', "there is no key 'naem', did you mean 'name'? there are name, store"),
-        ('every=-1\n[streams.a]\nsource="0"', "every must be a number of seconds from 0 to 3600, got -1"),
     ],
 )  # fmt: skip
 def test_an_error_of_the_file_is_one_line(load, lines, error, tmp_path):
@@ -131,11 +130,9 @@ def test_an_error_of_the_file_is_one_line(load, lines, error, tmp_path):
     ("line", "error"),
     [
         ("", "missing source: add one as for `catstream track`, for example source ="),
-        ("source = 7", "source must be a text, got 7"),
         ("sorce = '0'", "there is no key 'sorce', did you mean 'source'? there are source, box"),
         ("source = '0'\nbox = [1, 2, 3]", "a box is four numbers x,y,w,h in pixels, got [1, 2, 3]"),
         ("source = '0'\nbox = [1, 2, 30, 0]", "the box of the object without a name: a box needs a width and a height"),
-        ("source = '0'\nboxes = [1, 2, 3, 4]", "boxes must be a table, for example { anna = [120, 80, 64, 48] }, got"),
         ("source = '0'\nbox = [1, 2, 3, 4]\nboxes = {}", "box and boxes are mutually exclusive: write all"),
         ("source = '0'\ncores = 0", "cores must be a number above 0, got"),
         ("source = '0'\nwrite = 'a.csv'", "write must be destinations, for example ["),
@@ -172,15 +169,12 @@ def test_a_stored_state_that_is_damaged_is_an_error(data):
         from_json(data)
 
 
-def test_the_streams_of_the_example_begin_with_the_boxes_that_they_name():
-    fleet = FleetSpec.load(Path(__file__).parents[2] / "examples" / "fleet.toml")
+def test_the_example_and_the_files_in_the_docs_are_read(load):
+    root = Path(__file__).parents[2]
+    fleet = FleetSpec.load(root / "examples" / "fleet.toml")
     assert len(fleet.streams) == 6
-    for stream in fleet.streams.values():
-        assert list(stream.boxes.values()) == [first_box(stream.source)]
-
-
-def test_the_files_in_the_docs_are_read(load):
-    page = (Path(__file__).parents[2] / "docs" / "how-to" / "fleet.md").read_text(encoding="utf-8")
+    assert all([*stream.boxes.values()] == [first_box(stream.source)] for stream in fleet.streams.values())
+    page = (root / "docs" / "how-to" / "fleet.md").read_text(encoding="utf-8")
     six, whole = (part.partition("```")[0] for part in page.split("```toml\n")[1:])
     assert load(six).streams["gate"].options.picture
     assert load(whole).streams["cam-7"].labels == {"site": "north"}

@@ -145,19 +145,14 @@ FRAME = (320, 240)
     ("corners", "words"),
     [
         ("0.1,0.1 0.9,0.1 0.9,0.9 0.1,0.9", "not fractions"),
-        ("0,0 1,0 1,1 0,1", "not fractions"),
         ("1,2 3,4", "at least 3 corners, got 2"),
-        ("50,50 50,50 50,50", "on a line"),
-        ("10,10 20,20 30,30", "on a line"),
         ("10,10 200,10 200,10.001", "on a line"),
         ("0,0 100,100 100,0 0,100", "edges cross"),
         ("50,0 80,100 0,40 100,40 20,100", "edges cross"),
         ("2000,900 2100,900 2100,1000", "outside the frame of 320x240"),
-        ("-90,-90 -10,-90 -10,-10", "outside the frame"),
         ("310,-500 900,-500 900,90", "outside the frame"),  # the box around it is not outside
         ("1e12,1e12 2e12,1e12 2e12,2e12", "outside the frame"),
         ("1,2 3,4 5,nan", "finite"),
-        ("1,2 inf,4 5,6", "finite"),
     ],
 )
 def test_a_zone_that_nothing_can_enter_is_an_error(corners, words):

@@ -37,15 +37,11 @@ def test_values_of_a_file_and_of_the_command_line_give_the_same_options():
         ({"rotate": "1 week"}, "rotate: expected a time or a size, as 12h, 1d, 500MB or 2GB, got '1 week'"),
         ({"when": "gone"}, "when: expected some of found, lost, returned"),
         ({"when": "found=3"}, "when: expected some of found, lost, returned"),
-        ({"when": ""}, "when: expected some of found, lost, returned"),
         ({"when": "lost=soon"}, "when: expected 0 to 86400 seconds, as in lost=10, got 'lost=soon'"),
-        ({"when": "lost=inf"}, "when: expected 0 to 86400 seconds"),
         ({"when": "lost=nan"}, "when: expected 0 to 86400 seconds"),
         ({"rate": "0"}, "rate: must be a number above 0 and at most 1000, got '0'"),
-        ({"rate": "nan"}, "rate: must be a number above 0"),
         ({"megabytes": "none"}, "megabytes: must be a number above 0"),
         ({"when": "entered"}, "when entered has no effect without a zone: add zone"),
-        ({"when": "lost,left"}, "when left has no effect without a zone"),
     ],
 )
 def test_an_invalid_value_is_an_error(values, error):

@@ -77,17 +77,6 @@ def test_an_open_file_is_read_back_up_to_a_line_that_a_power_cut_tore(tmp_path, 
     assert list(Log(tmp_path / f"none{suffix}")) == []
 
 
-@pytest.mark.parametrize("name", ["t.ndjson", "t.csv"])
-def test_a_full_disk_is_reported_in_one_line_and_written_rows_are_kept(tmp_path, full, name):
-    sink = open_sink(str(tmp_path / name), Origin())
-    sink.write(TrackedFrame(TRACKS[:1]))
-    full(tmp_path / name)
-    with pytest.raises(VideoError, match=rf"cannot write '.*/{name}' \(No space left on device\)"):
-        sink.write(TrackedFrame(TRACKS[1:2]))
-    sink.close()
-    assert len(list(Log(tmp_path / name))) == 1
-
-
 @pytest.mark.parametrize("disk", [1 << 20], indirect=True)
 @pytest.mark.parametrize("source", ["rtsp://cam", "walk.mp4"])
 @pytest.mark.parametrize("names", [["t.ndjson"], ["t.csv"], ["t.sqlite"], ["t.ndjson", "t.csv"]], ids=" ".join)

@@ -66,12 +66,6 @@ def test_a_program_may_change_its_folder_during_a_run(video, tmp_path, monkeypat
     assert not list(later.iterdir())
 
 
-def test_before_its_start_a_pipeline_has_no_processes_and_no_endpoint(pipeline):
-    assert (pipeline.pids, pipeline.restarts, pipeline.health) == ({}, 0, {})
-    with pytest.raises(ServiceError, match="no endpoint before it has started"):
-        _ = pipeline.endpoint
-
-
 def test_every_attribute_in_the_docstring_exists(pipeline):
     section = Pipeline.__doc__.split("    Attributes\n")[1].split("\n\n")[0]
     names = [

@@ -11,14 +11,7 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, ru
 
 from catstream.base.box import Box, Window
 from catstream.errors import ProtocolError
-from catstream.processes.decisions import (
-    DesiredObject,
-    DesiredState,
-    TrainingLag,
-    resume_at,
-    stored,
-    with_end,
-)
+from catstream.processes.decisions import DesiredObject, DesiredState, TrainingLag, resume_at, stored, with_end
 from catstream.wire.go_back_n import ReceiveWindow
 from catstream.wire.messages import DetectorState, Position
 
@@ -87,13 +80,6 @@ def test_a_restarted_detector_loses_no_frame_and_learns_from_none_twice(
         assert continues != begins, "each object either continues with its state, or begins again"
         assert not continues or name in versions, "without a model there is nothing to continue with"
         assert replace(each, begins=0, box=BOX) == replace(desired.objects[name], begins=0, box=BOX)
-
-
-def test_restart_without_a_model_tracks_from_the_first_frame_of_the_object():
-    desired = DesiredState({"anna": DesiredObject(BOX, 3), "ben": DesiredObject(BOX, 5)})
-    position = Position(0, 8, states={"anna": STATE})
-    start = resume_at(position, 6, desired, live=False)
-    assert (start.seq, start.repeats, start.desired, start.states) == (2, 8, desired, {})
 
 
 def test_an_object_of_which_nothing_was_learned_begins_again_where_it_was_last():

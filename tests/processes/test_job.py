@@ -15,7 +15,7 @@ from catstream.base.box import Box
 from catstream.base.settings import Settings
 from catstream.errors import ProtocolError, ServiceError
 from catstream.processes.job import Job, Results
-from catstream.processes.state import files, locked, locked_for_run, restore
+from catstream.processes.state import files, locked, locked_for_run
 from catstream.wire import storage
 
 JOB = Job("rtsp://me:secret@10.0.0.7/one", {"anna": Box(1, 2, 30, 40)}, part=slice(0, None, 1), size=(320, 240))
@@ -131,17 +131,6 @@ def test_a_saved_model_that_is_stored_while_a_state_is_read_is_in_it_if_it_is_na
     content = files(tmp_path)
     assert b"0a" in content["desired_state.json"]
     assert "searched_models/0a.safetensors" in content
-
-
-def test_a_state_is_restored_with_its_searched_models_and_newest_checkpoint(tmp_path):
-    names = ["desired_state.json", "job.safetensors", "searched_models/0af3.safetensors", "trees/000002.safetensors"]
-    for name in [*names, "trees/000001.safetensors", "log", "searched_models/.part"]:
-        (tmp_path / "old" / name).parent.mkdir(parents=True, exist_ok=True)
-        (tmp_path / "old" / name).write_text(name)
-    content = files(tmp_path / "old")
-    assert sorted(content) == names
-    restore(tmp_path / "new", content)
-    assert all((tmp_path / "new" / name).read_text() == name for name in names)
 
 
 def test_a_resumed_run_writes_its_own_list_of_files_or_else_the_earlier_one():

@@ -61,14 +61,11 @@ def test_grey_is_expanded(bgr, form):
             r"got tuple: pass the image alone, as in `ok, frame = capture.read\(\)`",
         ),
         (np.zeros((4, 5, 3), bool), "got bool: a mask is not a picture"),
-        (np.zeros((4, 5, 3), np.int64), "got int64: frame.astype"),
         (np.zeros((3, 4, 5), np.uint8), r"got the shape \(3, 4, 5\): the channels come last"),
         (np.zeros((2, 4, 5, 3), np.uint8), r"got the shape \(2, 4, 5, 3\): pass one image of a batch"),
-        (np.zeros(7, np.uint8), r"got the shape \(7,\)"),
         (np.zeros((0, 5, 3), np.uint8), "has no pixels"),
         (np.full((4, 5, 3), 200.0), "got float64 from 200 to 200: frame.astype"),
         (np.full((4, 5, 3), np.nan), "got float64 with NaN or infinity: check how the frame was computed"),
-        (np.full((4, 5, 3), "x", object), "got object: check where"),
     ],
 )
 def test_an_array_that_is_no_image_is_one_line_of_error_with_a_remedy(image, told):

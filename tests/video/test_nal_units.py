@@ -103,10 +103,7 @@ def test_no_frame_over_rtsp_waits_for_the_next_one(access_units):
 
 def test_a_camera_whose_fragments_have_several_lengths_is_read_with_the_parser(access_units, monkeypatch):
     monkeypatch.setattr(rtsp, "payloads", shrinking)
-    with (
-        Broadcast("h264", (240, 160), access_units) as camera,
-        open_source(*camera.urls) as source,
-    ):
+    with Broadcast("h264", (240, 160), access_units) as camera, open_source(*camera.urls) as source:
         assert next(source).image.shape == (160, 240, 3)
         assert source.counters["reconnects"] == 0
 

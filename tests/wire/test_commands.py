@@ -165,10 +165,7 @@ def test_of_a_flood_of_commands_64_wait_others_are_rejected_and_stop_passes(endp
 
 @pytest.mark.parametrize(
     ("box", "problem"),
-    [
-        ("10,10,0,20", "at least 2 pixels, got 0 x 20"),
-        ("nan,10,20,20", "four finite numbers, got nan,10,20,20"),
-    ],
+    [("10,10,0,20", "at least 2 pixels, got 0 x 20"), ("nan,10,20,20", "four finite numbers, got nan,10,20,20")],
 )
 def test_an_invalid_box_is_rejected_before_it_is_sent(endpoint, box, problem):
     with Control(endpoint) as control, pytest.raises(BoxError, match=problem):

@@ -56,10 +56,7 @@ def test_the_limits_and_the_bytes_agree_with_the_codec():
 def test_the_subscriber_of_the_page_receives_every_track(endpoint, until):
     assert Endpoint.parse("tcp://127.0.0.1:5700").address(TRACKS) in PROGRAM
     reading = [sys.executable, "-c", PROGRAM, endpoint.address(TRACKS)]
-    with (
-        Publisher(TRACKS, endpoint) as tracks,
-        subprocess.Popen(reading, stdout=subprocess.PIPE, text=True) as reader,
-    ):
+    with Publisher(TRACKS, endpoint) as tracks, subprocess.Popen(reading, stdout=subprocess.PIPE, text=True) as reader:
         until(lambda: select.select([reader.stdout], [], [], 0.05)[0], lambda: tracks.send(track(1)))
         for seq in range(2, 20):
             for name in ("anna", "ben"):
