@@ -35,7 +35,8 @@ class MultiTracker:
 
     The same frames and settings give the same boxes, bit for bit, as a `catstream.Pipeline` in lockstep. During a call,
     linear algebra in this process runs on one thread; the previous number is restored when it returns. One thread at a
-    time may call a tracker; trackers in several threads are independent.
+    time may call a tracker; trackers in several threads are independent. The update that first estimates a motion, in
+    the 64th frame of an object, takes up to a second longer, because it imports filterpy.
 
     A frame is an array as `catstream.Tracker` takes it.
 
