@@ -119,18 +119,10 @@ def write_raw(path: Path, result: Result) -> None:
             receipts = [each for each in result.subscribers if each.stream == number]
             own = [("tracks", "", stream.track), ("models", "", stream.model)]
             extra = [(each.channel, str(index), row) for each in receipts for index, row in enumerate(each.latency)]
+            texts = [f"{moment:.6f}" for moment in stream.due - result.streams[0].due[0]]
             for channel, subscriber, latency in (*own, *extra):
-                for frame, seconds in enumerate(latency):
-                    moment = stream.due[frame] - result.streams[0].due[0]
-                    yield (
-                        number,
-                        channel,
-                        subscriber,
-                        frame,
-                        f"{moment:.6f}",
-                        int(stream.tracked[frame]),
-                        f"{seconds:.6f}",
-                    )
+                for frame, values in enumerate(zip(texts, map(int, stream.tracked), latency, strict=True)):
+                    yield number, channel, subscriber, frame, *values[:2], f"{values[2]:.6f}"
 
     heads = ("stream", "channel", "subscriber", "frame", "due_seconds", "tracked", "latency_seconds")
     write_table(path, heads, rows())

@@ -55,20 +55,15 @@ def timeline(
     figures["frames_per_second"] = [rate * len(streams) * (1 - share) for share in figures["skipped"]]
 
     # Step 2: processor and memory at the end of each interval, interpolated between the readings.
-    points = {
-        "cores": [(reading.moment, _of_pipelines(reading.cores)) for reading in readings],
-        "load_cores": [
-            (reading.moment, sum(reading.cores.values()) - reading.cores[REST] - _of_pipelines(reading.cores))
-            for reading in readings
-        ],
-        "other_cores": [(reading.moment, reading.cores[REST]) for reading in readings],
-        "memory": [(reading.moment, _of_pipelines(reading.memory)) for reading in readings if reading.memory],
-    }
-    for name, values in points.items() if readings else ():
-        figures[name] = np.interp(start + seconds + interval, *np.transpose(values)).tolist()
+    def of_pipelines(amounts: Mapping[str, float]) -> float:
+        return sum(amount for name, amount in amounts.items() if name[-1].isdigit())  # the number of the stream
+
+    if readings:
+        moments = [reading.moment for reading in readings]
+        cores = np.array([(of_pipelines(each.cores), sum(each.cores.values()), each.cores[REST]) for each in readings])
+        cores[:, 1] -= cores[:, 0] + cores[:, 2]
+        for name, values in zip(("cores", "load_cores", "other_cores"), cores.T, strict=True):
+            figures[name] = np.interp(start + seconds + interval, moments, values).tolist()
+        memory = [(reading.moment, of_pipelines(reading.memory)) for reading in readings if reading.memory]
+        figures["memory"] = np.interp(start + seconds + interval, *np.transpose(memory)).tolist()
     return figures
-
-
-def _of_pipelines(amounts: Mapping[str, float]) -> float:
-    """The sum of the processes of all pipelines, whose names end with the number of the stream."""
-    return sum(amount for name, amount in amounts.items() if name[-1].isdigit())
