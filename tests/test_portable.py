@@ -55,7 +55,8 @@ if __name__ == "__main__":
         with open("boxes.csv", "w") as table:
             table.write(f"file,object,x,y,w,h,frame\\n{video},anna,{first},0\\n")
         run("batch", "boxes.csv", "--output", "batch", "--jobs", "1")
-        run("annotate", video, "--box", f"anna@0={first}", "--box", f"anna@11={last}", "--output", "annotated")
+        boxes = ["--box", f"anna@0={first}", "--box", f"anna@11={last}"]
+        run("annotate", video, *boxes, "--output", "annotated", "--jobs", "1")
         run("export", "annotated/demo.ndjson", "demo.csv")
         run("report", "annotated")
     else:
