@@ -27,6 +27,15 @@ def test_a_model_for_which_the_disk_has_no_room_is_said_and_the_one_before_is_ke
 
 
 @pytest.mark.parametrize("disk", [SMALL], indirect=True)
+def test_checkpoints_for_which_the_disk_has_no_room_are_said_and_the_run_goes_on(video, said, disk, tmp_path):
+    source, box = video
+    code, _, errors = said("track", source, "--box", box, "--output", tmp_path, "--state", disk / "kept")
+    assert "No space left on device" in errors
+    assert len((tmp_path / "demo.ndjson").read_text().splitlines()) == 1 + 32
+    assert code == 0
+
+
+@pytest.mark.parametrize("disk", [SMALL], indirect=True)
 def test_a_camera_is_tracked_while_the_disk_is_full_and_rows_are_written_again_after_it(
     catstream, succeed, disk, fill, until, tmp_path
 ):

@@ -117,7 +117,7 @@ def test_if_no_pipeline_runs_that_is_reported_in_one_line(fail, tmp_path, words)
     assert fail(*words, env=nowhere).startswith("catstream: no pipeline of yours is running: start one")
 
 
-def test_command_names_the_only_pipeline_that_it_selects(said, commanded):
+def test_command_names_the_only_pipeline_that_it_selects(said, fail, commanded):
     with (
         private_folder() as own,
         reserve_endpoint("", own, source="/films/walk.mp4") as place,
@@ -126,6 +126,7 @@ def test_command_names_the_only_pipeline_that_it_selects(said, commanded):
         answer = said("stop")
     assert answer == (0, "stop was done\n", f"pipeline: /films/walk.mp4 at {place}\n")
     assert heard == ["stop"]
+    assert "is empty" in fail("stop", "--endpoint", "")
 
 
 def test_at_an_endpoint_that_a_pipeline_has_left_no_command_is_answered(fail, tmp_path):

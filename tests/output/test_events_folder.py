@@ -10,8 +10,9 @@ import pytest
 
 from catstream.base.box import Box
 from catstream.client.address import Address
+from catstream.errors import VideoError
 from catstream.output import events_folder, remote
-from catstream.output.destinations import Origin, SinkOptions, TrackedFrame, open_sink
+from catstream.output.destinations import Origin, SinkOptions, TrackedFrame, check_sink, open_sink
 from catstream.wire.channels import PREVIEWS
 from catstream.wire.messages import Preview, Track
 from catstream.wire.newest import Publisher
@@ -77,6 +78,12 @@ def test_the_oldest_pictures_are_removed_and_other_files_stay(tmp_path, endpoint
     assert (tmp_path / "holiday.jpg").exists()
     assert kinds(tmp_path)[-2:] == ["returned-anna", "lost-anna"]
     assert sum(file.stat().st_size for file in tmp_path.glob("2*.jpg")) <= 4 * len(image)
+
+
+def test_a_folder_that_cannot_be_made_is_an_error_before_the_run(tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(VideoError, match=r"cannot make the folder .*: Not a directory"):
+        check_sink(f"{tmp_path}/file/events/", SinkOptions())
 
 
 def test_each_event_is_a_line_of_json_which_names_its_picture(tmp_path, endpoint, until, image, monkeypatch):

@@ -22,6 +22,9 @@ def pipeline(video):
 
 
 def test_pipeline_iterated_without_with_leaves_no_process(pipeline):
+    assert (pipeline.pids, pipeline.restarts, pipeline.health) == ({}, 0, {})
+    with pytest.raises(ServiceError, match="no endpoint before it has started"):
+        _ = pipeline.endpoint
     assert [track.frame for track in pipeline] == list(range(20))
     assert (pipeline.totals["sent"], pipeline.totals["stored"]) == (20, 20)
     assert not pipeline.pids

@@ -12,6 +12,7 @@ from starlette.exceptions import HTTPException
 from catstream.client.address import Address
 from catstream.web import wall
 from catstream.web.wall import Wall
+from catstream.wire.endpoint import Endpoint
 
 TOKEN = "correct-horse-battery"
 PATHS = ["/", "/status", "/metrics", "/streams/cam-7/", "/streams/cam-7/events"]
@@ -61,6 +62,17 @@ def test_the_newest_picture_of_a_stream_is_received_only_while_somebody_asks(fle
     assert picture.headers["content-type"] == "image/jpeg"
     assert cv2.imdecode(np.frombuffer(picture.content, np.uint8), cv2.IMREAD_COLOR).shape[1] == 640
     assert page.get("/streams/cam-8/picture.jpg").status_code == 404
+
+
+def test_the_page_of_a_stream_follows_it_to_another_node(fleet, serve_fleet, camera_at, folder, until, monkeypatch):
+    monkeypatch.setattr("catstream.web.feed.SILENCE_SECONDS", 1.0)
+    fleet.stream("cam-7")
+    page = serve_fleet()
+    for node in ("north", "south"):
+        (folder / node).mkdir()
+        fleet.stream("cam-7", node=node, endpoint=str(folder / node))
+        turn = camera_at(Endpoint.parse(str(folder / node)), source=f"walk.mp4 at {node}")
+        until(lambda node=node: source(page) == f"walk.mp4 at {node}", turn)
 
 
 def test_a_fleet_that_does_not_answer_is_not_ready_and_has_no_metrics_of_streams(
