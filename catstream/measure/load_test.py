@@ -10,6 +10,7 @@ from functools import partial
 from math import inf
 from os import getpid
 from time import monotonic
+from typing import Any
 
 from catstream.client.address import Address
 from catstream.errors import ServiceError, SettingsError, errors_in
@@ -216,8 +217,11 @@ def run_load_test(
     load_test = LoadTest(limits, find)
 
     def holds(number: int) -> bool:
+        changes: dict[str, Any] = {find: number} if find else {}
+        if find == "subscribers":
+            changes["slow_subscribers"] = min(number, plan.slow_subscribers)
         try:
-            result = run(_step(plan, find, number), video, report)
+            result = run(replace(plan, **changes), video, report)
         except ServiceError as error:
             if not load_test.results:
                 raise
@@ -239,18 +243,6 @@ def run_load_test(
     except KeyboardInterrupt:
         load_test.interrupted = True
     return load_test
-
-
-def _step(plan: Plan, find: str | None, number: int) -> Plan:
-    """The plan of a step of a search."""
-    match find:
-        case "streams":
-            return replace(plan, streams=number)
-        case "rate":
-            return replace(plan, rate=float(number))
-        case "subscribers":
-            return replace(plan, subscribers=number, slow_subscribers=min(number, plan.slow_subscribers))
-    return plan
 
 
 def find_highest(start: int, holds: Callable[[int], bool], most: int) -> int | None:
