@@ -74,6 +74,8 @@ def test_an_open_file_is_read_back_up_to_a_line_that_a_power_cut_tore(tmp_path, 
             path.write_bytes(whole + torn)
             found = list(Log(path))
             assert [frame.tracks for frame in found] == [[track] for track in kept]
+        path.write_bytes(whole[:40])  # a part of the first line
+        assert list(Log(path)) == []
     assert list(Log(tmp_path / f"none{suffix}")) == []
 
 

@@ -302,6 +302,17 @@ def test_a_message_that_is_missing_is_reported_at_once_and_then_only_now_and_the
     assert window.receive(b"peer", 5, now=PATIENCE_SECONDS + 0.01) == report
 
 
+def test_a_sender_goes_back_to_what_was_taken_and_once_on_each_connection():
+    window = filled(size=5, count=5)
+    window.receive(Position(2, 3, again=True), now=1.0)
+    assert frames(window) == [payload(4), payload(5)]
+    window.receive(Position(2, 3, again=True), now=1.3)
+    assert frames(window) == []
+    window.disconnected()
+    window.receive(Position(2, 2, again=True), now=1.6)
+    assert frames(window) == [payload(3), payload(4), payload(5)]
+
+
 def test_a_sender_asks_only_while_messages_wait_and_not_more_often_than_its_patience():
     window = SendWindow("features", 4, now=0.0)
     assert not window.must_ask(99.0)
