@@ -350,7 +350,7 @@ def _turning(turn, pause=0.01):
             yield
         finally:
             over.set()
-            running.result(20)
+            running.result(300)
 
 
 @pytest.fixture

@@ -54,8 +54,8 @@ def test_services_track_an_object_whose_box_is_set_later(folder, tmp_path, until
         for name in NAMES:
             _, _, *check = here(SERVICES[name]["healthcheck"]["test"])
             until(lambda check=check: subprocess.run([sys.executable, *check], check=False).returncode == 0)
-        with control(run, timeout=60) as pipeline:
+        with control(run, timeout=500) as pipeline:
             pipeline.set_box(first_box("demo:1"))
         until(lambda: any('"box"' in log.read_text() for log in (tmp_path / "tracks").glob("*.ndjson")))
         processes["detector"].terminate()
-        assert [processes[name].wait(60) for name in (*NAMES, "tracks")] == [0] * 4
+        assert [processes[name].wait(500) for name in (*NAMES, "tracks")] == [0] * 4

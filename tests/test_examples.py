@@ -53,7 +53,7 @@ def beside(demo_video):
             for track in pipeline:
                 tracks[track.frame] = track
                 speaks = speaks or select.select([process.stdout], [], [], 2)[0]  # while it starts, few frames pass
-            printed, _ = process.communicate(timeout=150)
+            printed, _ = process.communicate(timeout=500)
         assert process.returncode == 0
         return tracks, printed.splitlines()
 
@@ -82,7 +82,7 @@ def test_the_example_of_several_objects_prints_when_two_meet_and_part(demo_video
     sky = catstream.Box(boxes[0].x, boxes[0].y - 30, boxes[0].w, 40)  # the lower part of it is on the flower
     with ExitStack() as stack:
         example = started(stack, "several_objects.py", source, f"flower={boxes[0]}", f"sky={sky}")
-        first, *_, flower, sky = example.communicate(timeout=150)[0].splitlines()
+        first, *_, flower, sky = example.communicate(timeout=500)[0].splitlines()
     assert first == "frame 0: flower and sky meet"
     assert flower == "flower: present in 60 of 60 frames"
     assert re.fullmatch(r"sky: present in \d+ of 60 frames", sky)
@@ -93,7 +93,7 @@ def test_the_images_that_represent_a_folder_are_printed(demo_video, tmp_path):
         for frame in frames:
             cv2.imwrite(str(tmp_path / f"{frame.number:02d}.png"), frame.image)
     with ExitStack() as stack:
-        printed, _ = started(stack, "summarise_images.py", tmp_path, 4).communicate(timeout=150)
+        printed, _ = started(stack, "summarise_images.py", tmp_path, 4).communicate(timeout=500)
     assert printed.count(".png") == 4
     assert "of the energy of all images is kept" in printed
 
@@ -122,9 +122,9 @@ def test_a_ground_station_selects_an_object_and_is_told_where_it_is(demo_video, 
         def result_of(name, *values):
             number = getattr(mavlink, f"MAV_CMD_{name}")
             link.mav.command_long_send(1, 100, number, 0, *values, *[0] * (7 - len(values)))
-            return link.recv_match(type="COMMAND_ACK", blocking=True, timeout=150).result
+            return link.recv_match(type="COMMAND_ACK", blocking=True, timeout=500).result
 
-        assert link.recv_match(type="HEARTBEAT", blocking=True, timeout=150).type == mavlink.MAV_TYPE_CAMERA
+        assert link.recv_match(type="HEARTBEAT", blocking=True, timeout=500).type == mavlink.MAV_TYPE_CAMERA
         status = mavlink.MAVLINK_MSG_ID_CAMERA_TRACKING_IMAGE_STATUS
         assert result_of("SET_MESSAGE_INTERVAL", status, 1) == mavlink.MAV_RESULT_ACCEPTED  # microsecond
         x, y, w, h = boxes[0]
@@ -137,7 +137,7 @@ def test_a_ground_station_selects_an_object_and_is_told_where_it_is(demo_video, 
         assert (found.rec_top_x, found.rec_top_y) == pytest.approx(corners[:2], abs=0.1)
         assert result_of("CAMERA_STOP_TRACKING") == mavlink.MAV_RESULT_ACCEPTED
         pipeline.close()
-        assert "no longer tracked" in camera.communicate(timeout=150)[0]
+        assert "no longer tracked" in camera.communicate(timeout=500)[0]
 
 
 def test_the_zone_counter_counts_beside_a_run(beside):

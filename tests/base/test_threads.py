@@ -63,13 +63,13 @@ def test_the_last_of_two_threads_restores_the_number():
 
     def first():
         with one_thread():
-            both.wait(150)
-        first_left.wait(150)
+            both.wait(500)
+        first_left.wait(500)
 
     def last():
         with one_thread():
-            both.wait(150)
-            first_left.wait(150)
+            both.wait(500)
+            first_left.wait(500)
             return set(counts().values())
 
     with ThreadPoolExecutor(2) as pool:

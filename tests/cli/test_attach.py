@@ -14,7 +14,7 @@ from catstream.pipeline import Pipeline
 from catstream.processes.start_server import NAMES
 from catstream.wire.messages import Health, Track
 
-SECONDS = 60  # that anything may take on a busy machine
+SECONDS = 500  # that anything may take on a busy machine
 
 
 #: A pipeline continues only if its tracks are received.

@@ -186,10 +186,10 @@ def test_a_batch_is_completed_after_a_worker_was_killed_or_ctrl_c(demo_video, ca
     children = psutil.Process(run.pid).children()
     worker = next(child for child in children if "spawn_main" in " ".join(child.cmdline()))
     (worker if number == signal.SIGKILL else run).send_signal(number)
-    errors = run.communicate(timeout=150)[1]
+    errors = run.communicate(timeout=500)[1]
     if number == signal.SIGINT:
         assert (run.returncode, "the same command continues" in errors) == (130, True)
         run = catstream(*words)
-        errors = run.communicate(timeout=150)[1]
+        errors = run.communicate(timeout=500)[1]
     assert run.returncode == 0, errors
     assert {row["frames"] for row in summaries(tmp_path / "out").values()} == {"60"}

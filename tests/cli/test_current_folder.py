@@ -57,6 +57,6 @@ def test_no_file_in_the_current_folder_is_imported(name, walk, traps, tmp_path):
         "program": [sys.executable, tmp_path / "program.py", images, box, "12"],
         "all others": [sys.executable, "-P", "-c", EVERY_COMMAND, *COMMANDS],
     }[name]
-    done = subprocess.run(command, cwd=traps, capture_output=True, text=True, timeout=240, check=False)
+    done = subprocess.run(command, cwd=traps, capture_output=True, text=True, timeout=500, check=False)
     assert not [str(path.relative_to(traps)) for path in traps.rglob("*.sprung")]
     assert done.returncode == 0, done.stderr

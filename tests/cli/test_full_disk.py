@@ -69,7 +69,7 @@ def test_a_camera_is_tracked_while_the_disk_is_full_and_rows_are_written_again_a
 def test_output_for_which_the_disk_has_no_room_is_one_line_of_error(catstream, words):
     with Path("/dev/full").open("w") as full:
         process = catstream(*words, stdout=full)
-        assert process.communicate(timeout=150)[1] == "catstream: cannot write any more: No space left on device\n"
+        assert process.communicate(timeout=500)[1] == "catstream: cannot write any more: No space left on device\n"
     assert process.returncode == 1
 
 

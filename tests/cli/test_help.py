@@ -75,7 +75,7 @@ def test_ctrl_c_ends_a_command_with_130_and_no_traceback(catstream, until, tmp_p
     process = catstream("demo", "--frames", 100_000, cwd=tmp_path)
     until(lambda: list(tmp_path.glob("demo/*")) or process.poll() is not None)
     process.send_signal(signal.SIGINT)
-    errors = process.communicate(timeout=150)[1]
+    errors = process.communicate(timeout=500)[1]
     assert process.returncode == 130, errors
     assert errors.strip().splitlines()[-1] == "stopped"
     assert "Traceback" not in errors

@@ -16,7 +16,7 @@ from tests.learning import learned_from
 
 NEED_A_PIPELINE = [["set-box", "1,2,3,4"], ["search", "one"], ["save", "one"], ["watch", "tracks"]]
 NEED_A_PIPELINE += [[name] for name in ("forget", "pause", "resume", "stop", "status")]
-PATIENT = ("--timeout", 60)
+PATIENT = ("--timeout", 500)
 
 
 @pytest.fixture
@@ -36,7 +36,7 @@ def status(succeed, tmp_path):
     """The figures of `catstream status` about the pipeline of this test."""
 
     def ask():
-        output, _ = succeed("status", "--json", "--endpoint", tmp_path / "run", "--wait", 60)
+        output, _ = succeed("status", "--json", "--endpoint", tmp_path / "run", "--wait", 500)
         return json.loads(output)
 
     return ask
@@ -77,7 +77,7 @@ def test_run_without_a_box_waits_for_set_box_and_resume(video, catstream, steer,
     assert SavedModel.load(tmp_path / "one").model.frame == 0
     assert steer("set-box", box, "--keep") == (0, f"the same object continues at {box} in frame 1")
     assert steer("resume") == (0, "resumed after frame 1")
-    errors = run.communicate(timeout=120)[1]
+    errors = run.communicate(timeout=500)[1]
     assert run.returncode == 0, errors
     (hint,) = (line for line in errors.splitlines() if line.startswith("waiting for a box: "))
     assert f"catstream view --endpoint {tmp_path / 'run'}" in hint
@@ -94,7 +94,7 @@ def test_objects_begin_and_are_forgotten_by_name_in_a_paused_run(video, follow, 
     code, answer = steer("set-box", "ben=20,150,70,60")
     assert (code, answer.startswith("the object ben begins at 20,150,70,60 in frame")) == (0, True)
     until(lambda: status()["processes"]["detector"]["objects"].keys() == {"anna", "ben"})
-    table = said("status", "--endpoint", tmp_path / "run", "--wait", 60)[1].splitlines()
+    table = said("status", "--endpoint", tmp_path / "run", "--wait", 500)[1].splitlines()
     assert table[-3].split() == ["object", "state", "score", "model", "leaves"]
     assert {line.split()[0] for line in table[-2:]} == {"anna", "ben"}
     code, answer = steer("forget")
@@ -108,7 +108,7 @@ def test_objects_begin_and_are_forgotten_by_name_in_a_paused_run(video, follow, 
     assert steer("forget")[1].endswith("no object is left, so the run waits for a box")
     assert status()["state"] == "waiting"
     assert steer("stop")[0] == 0
-    assert {track.object for track in run.result(120)} == {"anna", "ben", "dora", "emil"}
+    assert {track.object for track in run.result(500)} == {"anna", "ben", "dora", "emil"}
 
 
 @pytest.mark.parametrize("words", NEED_A_PIPELINE, ids=" ".join)

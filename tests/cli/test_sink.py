@@ -30,8 +30,8 @@ def test_tracks_are_written_to_files_and_stay_there(long_video, catstream, tmp_p
                 select.select([sinks[folder].stderr for folder in waiting], [], [], 1)  # while they start, few pass
             if track.frame > 30 and stopped not in waiting and sinks[stopped].poll() is None:
                 sinks[stopped].send_signal(signal.SIGINT)
-                sinks[stopped].wait(150)
-        told = {folder: sink.communicate(timeout=150)[1] for folder, sink in sinks.items()}
+                sinks[stopped].wait(500)
+        told = {folder: sink.communicate(timeout=500)[1] for folder, sink in sinks.items()}
     for folder, sink in sinks.items():
         assert sink.returncode == 0, told[folder]
     assert written(whole, told[whole])[-1] == 59
@@ -74,7 +74,7 @@ def test_repeated_frames_after_a_restart_are_skipped_and_another_run_ends_the_si
 
         follow("first", (0, 300), (205, 310), written=310)
         follow("second", (0, 200), written=310)
-        errors = sink.communicate(timeout=150)[1]
+        errors = sink.communicate(timeout=500)[1]
     assert sink.returncode == 0, errors
     frames = [json.loads(line)["frame"] for line in file.read_text().splitlines()[1:]]
     assert frames == list(range(310))
@@ -91,7 +91,7 @@ def test_a_sink_that_starts_again_keeps_the_file_of_its_last_start(catstream, en
             lambda: health.send(Health("detector", time.time())),
         )
         sink.terminate()
-        sink.communicate(timeout=150)
+        sink.communicate(timeout=500)
     old, new = sorted(tmp_path.glob("*.ndjson"))
     assert (old.read_text(), new, new.read_text().count("\n")) == ("of the last start\n", file, 1)
 

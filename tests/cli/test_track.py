@@ -91,7 +91,7 @@ def test_a_reader_that_wants_no_more_ends_the_run_in_silence(video, catstream):
     process.stdout.close()
     assert process.stderr.read().strip() == ""
     process.stdout = None
-    assert process.wait(150) == 1
+    assert process.wait(500) == 1
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])  # test_track_live.py has SIGINT
@@ -230,5 +230,5 @@ def test_results_that_another_run_wrote_while_this_one_waited_are_not_replaced(v
     log = tmp_path / "demo.ndjson"
     log.write_text("of another run")
     succeed("resume", "--endpoint", place)
-    assert f"{log} exists already: replace it with --overwrite" in run.communicate(timeout=150)[1]
+    assert f"{log} exists already: replace it with --overwrite" in run.communicate(timeout=500)[1]
     assert (run.returncode, log.read_text()) == (1, "of another run")

@@ -37,7 +37,7 @@ class Run:
     def stopped(self):
         """Its rows and what it said, after Ctrl-C."""
         self.process.send_signal(signal.SIGINT)
-        errors = self.process.communicate(timeout=150)[1]
+        errors = self.process.communicate(timeout=500)[1]
         assert self.process.returncode == 130
         rows = list(csv.DictReader((self.output / "one.csv").read_text().splitlines()))
         assert len((self.output / "one.ndjson").read_text().splitlines()) == 1 + len(rows)
@@ -51,7 +51,7 @@ def following(catstream, story, tmp_path):
     @contextmanager
     def start(url, *more):
         output, place = tmp_path / "out", tmp_path / "run"
-        with subscribe(str(place), "health", timeout=150) as health:
+        with subscribe(str(place), "health", timeout=500) as health:
             box = ",".join(map(str, story[0][1]))
             command = ("track", url, "--box", box, "--output", output, "--set", f"run.endpoint={place}", *more)
             yield Run(catstream(*command), output, health)
@@ -85,7 +85,7 @@ def test_a_restarted_detector_tracks_an_http_stream_whose_frames_changed_their_s
 
 def test_ctrl_c_ends_a_run_whose_stream_is_lost(camera, following, said, story, tmp_path):
     cam = camera(lambda number: story[number % len(story)][0])
-    with following(cam.url) as run, subscribe(str(tmp_path / "run"), "tracks", timeout=150) as tracks:
+    with following(cam.url) as run, subscribe(str(tmp_path / "run"), "tracks", timeout=500) as tracks:
         next(tracks)
         cam.leave()
         run.until(lambda counters: counters.get("lost_seconds", 0) > 0)

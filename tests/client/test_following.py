@@ -57,20 +57,20 @@ def stream(until):
 def test_a_subscription_follows_its_stream_and_returns_repeated_frames_once(stream, managing):
     with managing(stream.status):
         first = stream.runs()
-        with catstream.subscribe("fleet://cam-7", "tracks", timeout=150) as tracks:
+        with catstream.subscribe("fleet://cam-7", "tracks", timeout=500) as tracks:
             watched = stream.watched(tracks)
             stream.send(first, *(track(seq, name) for seq in range(1, 6) for name in ("anna", "ben")), STOPPED)
             second = stream.runs()
             stream.send(second, *(track(seq, name) for seq in range(3, 9) for name in ("anna", "ben")), STOPPED)
             stream.update(state="ended", endpoint="")
-            assert watched.result(60) == [track(seq, name) for seq in range(1, 9) for name in ("anna", "ben")]
+            assert watched.result(500) == [track(seq, name) for seq in range(1, 9) for name in ("anna", "ben")]
             assert (tracks.missed, tracks.end) == (99 - 9, STOPPED)
 
 
 def test_a_stream_whose_end_arrives_after_that_of_its_pipeline_was_registered_ends_with_it(stream, managing):
     with managing(stream.status):
         first = stream.runs()
-        with catstream.subscribe("fleet://cam-7", "tracks", timeout=150) as tracks:
+        with catstream.subscribe("fleet://cam-7", "tracks", timeout=500) as tracks:
             stream.send(first, track(1), STOPPED)
             stream.update(state="ended")
             tracks._update(stream.status.streams["cam-7"])  # before anything is read
@@ -81,14 +81,14 @@ def test_a_stream_whose_end_arrives_after_that_of_its_pipeline_was_registered_en
 def test_frames_that_were_lost_between_two_nodes_are_counted_as_missed(stream, managing):
     with managing(stream.status):
         first = stream.runs()
-        with catstream.subscribe("fleet://cam-7", "tracks", timeout=150) as tracks:
+        with catstream.subscribe("fleet://cam-7", "tracks", timeout=500) as tracks:
             watched = stream.watched(tracks)
             stream.send(first, track(1), track(2))
             first.close()  # its node dies
             second = stream.runs()
             stream.send(second, track(9), track(10), End(10, "the source has ended"))
             stream.update(state="ended")
-            assert [message.seq for message in watched.result(60)] == [1, 2, 9, 10]
+            assert [message.seq for message in watched.result(500)] == [1, 2, 9, 10]
             assert tracks.missed == 6
 
 
@@ -97,7 +97,7 @@ def test_a_subscription_continues_without_the_controller_and_uses_it_once_it_is_
     with ExitStack() as controller:
         controller.enter_context(managing(stream.status, place))
         first = stream.runs()
-        with catstream.subscribe("fleet://site/cam-7", "tracks", timeout=150) as tracks:
+        with catstream.subscribe("fleet://site/cam-7", "tracks", timeout=500) as tracks:
             watched = stream.watched(tracks)
             stream.send(first, track(1))
             controller.close()
@@ -106,7 +106,7 @@ def test_a_subscription_continues_without_the_controller_and_uses_it_once_it_is_
             with managing(stream.status, place):
                 stream.send(second, track(3))
                 del stream.status.streams["cam-7"]
-                assert watched.result(60) == [track(1), track(2), track(3)]
+                assert watched.result(500) == [track(1), track(2), track(3)]
             assert tracks.end.reason == "the stream cam-7 was removed from the fleet site, or the fleet is down"
 
 
@@ -119,7 +119,7 @@ def test_a_subscription_waits_for_a_stream_that_runs_nowhere_yet(stream, managin
         watched = stream.watched(tracks)
         stream.send(stream.runs(), track(1), STOPPED)
         stream.update(state="ended")
-        assert watched.result(60) == [track(1)]
+        assert watched.result(500) == [track(1)]
 
 
 @pytest.mark.parametrize("change", [{"source": "run.mp4"}, {"live": True}])
@@ -127,13 +127,13 @@ def test_all_frames_of_another_source_and_of_a_live_stream_are_returned_after_a_
     """A live stream uses the numbers of the frames that it lost again."""
     with managing(stream.status):
         first = stream.runs()
-        with catstream.subscribe("fleet://cam-7", "tracks", timeout=150) as tracks:
+        with catstream.subscribe("fleet://cam-7", "tracks", timeout=500) as tracks:
             watched = stream.watched(tracks)
             stream.send(first, track(1), track(2))
             first.close()
             stream.send(stream.runs(**change), track(1), track(2), STOPPED)
             stream.update(state="ended")
-            assert [message.seq for message in watched.result(60)] == [1, 2, 1, 2]
+            assert [message.seq for message in watched.result(500)] == [1, 2, 1, 2]
 
 
 def test_a_stream_that_does_not_exist_or_has_ended_is_not_waited_for(stream, managing):
@@ -141,6 +141,6 @@ def test_a_stream_that_does_not_exist_or_has_ended_is_not_waited_for(stream, man
         with pytest.raises(ServiceError, match="site has no stream 'cam-8': its streams are cam-7"):
             catstream.subscribe("fleet://cam-8", "tracks")
         stream.update(state="ended")
-        with catstream.subscribe("fleet://cam-7", "tracks", timeout=150) as tracks:
+        with catstream.subscribe("fleet://cam-7", "tracks", timeout=500) as tracks:
             assert list(tracks) == []
             assert tracks.end.reason == "the stream cam-7 has ended"

@@ -41,7 +41,7 @@ def test_an_answer_that_is_no_state_of_a_fleet_is_an_error(folder, answer):
             for question in responder.receive_all(20):
                 responder.answer(Listing(question.id, answer))
 
-        with Registry(timeout=20) as registry, ThreadPoolExecutor(1) as pool:
+        with Registry(timeout=500) as registry, ThreadPoolExecutor(1) as pool:
             served = pool.submit(serve)
             with pytest.raises(ServiceError, match="invalid answer of the registry"):
                 registry.streams()

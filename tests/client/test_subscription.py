@@ -38,7 +38,7 @@ def attached(endpoint, tracks, until):
     """Makes a subscription to which the publisher of tracks is connected: it got the track with seq 1."""
 
     def subscribe(**options):
-        subscription = catstream.subscribe(str(endpoint), "tracks", timeout=60, **options)
+        subscription = catstream.subscribe(str(endpoint), "tracks", timeout=500, **options)
         until(lambda: len(tracks._subscribed) == 2, tracks.serve_late_joiners)  # the end has a connection of its own
         tracks.send(track(1, options.get("object", "")))
         assert next(subscription).seq == 1
@@ -105,7 +105,7 @@ def test_a_subscriber_to_one_object_receives_no_track_of_a_name_with_the_same_pr
     ids=["begins late, is forgotten early", "loses two", "begins again", "loses one in each life"],
 )
 def test_frames_in_which_an_object_was_not_there_are_not_missed(endpoint, tracks, until, said, missed):
-    with catstream.subscribe(str(endpoint), "tracks", object="anna", timeout=20) as subscription:
+    with catstream.subscribe(str(endpoint), "tracks", object="anna", timeout=500) as subscription:
         until(lambda: len(tracks._subscribed) == 2, tracks.serve_late_joiners)  # the end has a connection of its own
         for seq, began in said:
             tracks.send(replace(track(seq, "anna"), began=began))
@@ -150,7 +150,7 @@ def test_a_message_that_arrives_while_a_reader_is_suspended_at_the_end_is_read(e
     monkeypatch.setattr("catstream.client.subscription.DRAIN_SECONDS", 0.0)
     with (
         Publisher(MODELS, endpoint) as models,
-        catstream.subscribe(str(endpoint), "models", timeout=60) as subscription,
+        catstream.subscribe(str(endpoint), "models", timeout=500) as subscription,
     ):
         until(lambda: models.has_subscribers, models.serve_late_joiners)
         until(lambda: tracks._subscribed, tracks.serve_late_joiners)
@@ -216,7 +216,7 @@ def test_async_for_gives_the_same_and_may_be_cancelled(tracks, attached):
 
 
 def test_a_subscriber_ends_if_the_sockets_of_its_pipeline_are_gone_from_the_folder(folder, until):
-    with catstream.subscribe(str(folder), "tracks", timeout=20) as subscription:
+    with catstream.subscribe(str(folder), "tracks", timeout=500) as subscription:
         with reserve_endpoint(str(folder), folder) as place, Publisher(TRACKS, place) as publisher:
             until(lambda: publisher.has_subscribers, publisher.serve_late_joiners)
             publisher.send(track(1))

@@ -259,15 +259,15 @@ def test_while_the_store_hangs_the_registry_answers_and_streams_are_watched(site
 
     def put(*_):
         hangs.set()
-        goes_on.wait(150)
+        goes_on.wait(500)
 
     monkeypatch.setattr(StateStore, "put", put)
     change = threading.Thread(target=site.remove, args=(("roof",),))
     change.start()
     try:
-        assert hangs.wait(150)
+        assert hangs.wait(500)
         running(site, ray, "gate")
-        with Registry("site", timeout=30) as registry:
+        with Registry("site", timeout=500) as registry:
             until(lambda: registry.streams().streams["gate"].state == "running")
             assert registry.stream("gate").node == "n1"
     finally:

@@ -38,7 +38,7 @@ def s3_server():
             patch.setenv(name, value)
         patch.setenv("AWS_ENDPOINT_URL", "http://{}:{}".format(*server.get_host_and_port()))
         patch.setenv("AWS_DEFAULT_REGION", "us-east-1")
-        httpx.put(os.environ["AWS_ENDPOINT_URL"] + "/fleet", timeout=150)  # creates the bucket
+        httpx.put(os.environ["AWS_ENDPOINT_URL"] + "/fleet", timeout=500)  # creates the bucket
         yield server
     server.stop()
 

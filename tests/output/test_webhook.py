@@ -38,7 +38,7 @@ class Receiver:
         class Handler(BaseHTTPRequestHandler):
             def do_POST(self):
                 body = self.rfile.read(int(self.headers["Content-Length"]))
-                receiver.holds.wait(150)
+                receiver.holds.wait(500)
                 receiver.requests.append((self.path, self.headers, body))
                 status, *retry_after = receiver.answers.pop(0) if receiver.answers else (204,)
                 self.send_response(status)
@@ -242,5 +242,5 @@ def test_a_zone_outside_the_frame_of_a_running_pipeline_ends_the_sink(endless, c
             if sink.poll() is not None:
                 break
             sleep(0.3)
-        errors = sink.communicate(timeout=150)[1]
+        errors = sink.communicate(timeout=500)[1]
     assert "zone door: it is outside the frame of 320x240 pixels" in errors

@@ -121,7 +121,7 @@ def test_a_copy_of_a_program_that_was_forked_touches_nothing_of_the_run(video):
     """One that exits, one that fails, and one that uses what it inherited."""
     path, boxes = video
     command = [sys.executable, "-c", FORKS, path, ",".join(map(str, boxes[0]))]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=100)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=500)
     assert done.stdout.split() == ["7", "1", "7", "True", str(len(boxes)), "0"], done.stderr
 
 

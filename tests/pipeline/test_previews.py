@@ -25,7 +25,7 @@ def looks(endpoint, previews, until):
     """Somebody begins to look."""
 
     def begin():
-        reader = subscribe(str(endpoint), "previews", timeout=150)
+        reader = subscribe(str(endpoint), "previews", timeout=500)
         until(lambda: previews.has_subscribers, previews.turn)
         return reader
 
@@ -62,7 +62,7 @@ def test_previews_continue_while_no_object_is_tracked(previews, looks, until):
 def test_frames_of_previews_are_kept_for_five_seconds_while_there_are_subscribers(endpoint, until, monkeypatch):
     monkeypatch.setattr("catstream.processes.outputs._PREVIEW_SECONDS", 0.0)
     with Previews(endpoint, stores=True) as previews:
-        with subscribe(str(endpoint), "previews", timeout=150):
+        with subscribe(str(endpoint), "previews", timeout=500):
             until(lambda: previews.has_subscribers, previews.turn)
             for number in range(80):
                 previews.show(3, Frame(number, number / 10, np.zeros((48, 64, 3), np.uint8)), {})

@@ -43,7 +43,7 @@ def test_processes_started_manually_in_any_order_complete_a_run(video, folder, t
     path, boxes = video
     order = "detector", "trainer", "compressor"
     processes = by_hand("--resume", path, box=boxes[0], order=order, endpoint=tcp)
-    assert [process.wait(120) for process in processes] == [0, 0, 0]
+    assert [process.wait(500) for process in processes] == [0, 0, 0]
     assert CheckpointStore(folder / CHECKPOINTS).load(Settings()).seq == len(boxes)
 
 
@@ -69,7 +69,7 @@ def test_no_process_outlives_its_program(video, number, until, alive):
         pids = [int(pid) for pid in program.stdout.readline().split()]
         pids.append(psutil.Process(pids[0]).ppid())
         program.send_signal(number)
-        program.wait(150)
+        program.wait(500)
     assert len(pids) == 1 + len(NAMES)
     until(lambda: not any(map(alive, pids)))
 
@@ -81,7 +81,7 @@ def test_processes_that_are_stopped_together_end_in_order_and_all_is_stored(vide
         for process in processes:
             process.send_signal(signal.SIGTERM)
         end = until(lambda: next((m for m in iter(lambda: tracks.receive(0.1), None) if isinstance(m, End)), None))
-        assert [process.wait(150) for process in processes] == [0, 0, 0]
+        assert [process.wait(500) for process in processes] == [0, 0, 0]
     assert end.totals["stored"] == end.totals["sent"]
 
 

@@ -16,7 +16,7 @@ from catstream.video.source import open_source
 
 #: A small window keeps the detector near the frame that a test has reached.
 SETTINGS = Settings(run={"unstored_frames": 16})
-SECONDS = 60  # that an answer may take on a busy machine
+SECONDS = 500  # that an answer may take on a busy machine
 PATCH = (20, 150, 70, 60)  # of the lake, which the object does not come to
 
 

@@ -74,7 +74,7 @@ class _Patient(Broadcast):
 
     def frames(self, _):
         for number, access_unit in enumerate(self._units):
-            self.received.acquire(timeout=20)
+            self.received.acquire(timeout=500)
             yield 1 + number / 25, access_unit
 
 

@@ -70,7 +70,7 @@ def serve_site():
         def start(site, **options):
             server = Server(site, port=0, **options)
             stack.enter_context(server.in_background())
-            return stack.enter_context(httpx.Client(base_url=server.url.partition("?")[0], timeout=150, verify=False))
+            return stack.enter_context(httpx.Client(base_url=server.url.partition("?")[0], timeout=500, verify=False))
 
         yield start
 

@@ -160,7 +160,7 @@ def serving(catstream, demo, tmp_path):
             env=os.environ | {"PYTHONUNBUFFERED": "1"},
         )
         link = process.stdout.readline().strip()
-        with httpx.Client(base_url=link.partition("?")[0], timeout=150, follow_redirects=True) as client:
+        with httpx.Client(base_url=link.partition("?")[0], timeout=500, follow_redirects=True) as client:
             assert client.get(link).status_code == 200
             yield process, client
 
@@ -173,7 +173,7 @@ def test_command_continues_where_it_was_interrupted_until_it_is_done(serving, de
         until(lambda: state(client)["decoded"])
         send(client, "draw", object="anna", frame=0, box=box)
         process.terminate()
-        assert process.wait(150) == 143
+        assert process.wait(500) == 143
     assert (tmp_path / "out" / "keyframes.csv").read_text().splitlines()[1].startswith("0,anna,")
     assert (tmp_path / "out" / "demo.ndjson").exists()
     with serving() as (process, client):
@@ -181,7 +181,7 @@ def test_command_continues_where_it_was_interrupted_until_it_is_done(serving, de
         assert [one["name"] for one in state(client)["objects"]] == ["anna"]
         send(client, "draw", object="anna", frame=FRAMES - 1)
         assert send(client, "done").json()["done"]
-        assert process.wait(150) == 0
+        assert process.wait(500) == 0
         assert "2 keyframes" in process.stdout.read()
     assert len((tmp_path / "out" / "demo.csv").read_text().splitlines()) == FRAMES + 1
 

@@ -97,6 +97,6 @@ def test_object_of_a_camera_is_tracked_from_the_still_picture_of_its_box(script_
         assert browser.stdout.readline() == "still true\n"
         assert " s before frame 0" in browser.stdout.readline()
         assert browser.stdout.readline() == "errors []\n"
-        with subscribe(str(folder), "previews", timeout=150) as pictures:
+        with subscribe(str(folder), "previews", timeout=500) as pictures:
             shown = next(pictures)
         assert shown.boxes[""].overlap(find(shown.jpeg)) > 0.5

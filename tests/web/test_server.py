@@ -311,12 +311,12 @@ def test_second_interrupt_during_the_shutdown_does_not_cut_it_short(monkeypatch)
 def test_command_that_waits_for_its_answer_is_answered_at_the_end_of_the_server(folder, monkeypatch, caplog):
     begun, answered = threading.Event(), threading.Event()
     monkeypatch.setattr("catstream.web.server.SHUTDOWN_SECONDS", 1)
-    monkeypatch.setattr(PipelineFeed, "execute", lambda *_, **__: begun.set() or answered.wait(150))
+    monkeypatch.setattr(PipelineFeed, "execute", lambda *_, **__: begun.set() or answered.wait(500))
     server = Server(Site(PipelineFeed(Address(str(folder)))), port=0)
     with ThreadPoolExecutor(1) as pool:
         with server.in_background():
-            asked = pool.submit(httpx.post, f"{server.url}control", json={"verb": "pause"}, timeout=150)
-            assert begun.wait(150)
+            asked = pool.submit(httpx.post, f"{server.url}control", json={"verb": "pause"}, timeout=500)
+            assert begun.wait(500)
         answer = asked.result()
         answered.set()
     assert (answer.status_code, answer.text) == (503, "the server of this page has ended\n")

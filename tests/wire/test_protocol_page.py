@@ -62,7 +62,7 @@ def test_the_subscriber_of_the_page_receives_every_track(endpoint, until):
             for name in ("anna", "ben"):
                 tracks.send(Track(seq - 1, 0.0, "present", Box(1.0, 2.0, 3.0, 4.0), 0.5, 1, object=name))
         tracks.send(End(19, "the source has ended"))
-        lines = reader.communicate(timeout=150)[0].splitlines()
+        lines = reader.communicate(timeout=500)[0].splitlines()
     assert reader.returncode == 0
     assert [line for line in lines if "present" in line] == [
         f"{frame} {name} present [1.0, 2.0, 3.0, 4.0] 0.5" for frame in range(1, 19) for name in ("anna", "ben")

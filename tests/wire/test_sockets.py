@@ -65,7 +65,7 @@ def test_a_receiver_with_a_full_queue_survives_its_sender(endpoint, until):
             for seq in range(1, 9):
                 sender.send(tracks(seq))
             until(lambda: select.select([busy.stdout], [], [], 0)[0], lambda: sender.poll(0.1))
-        assert busy.communicate("gone\n", timeout=150)[0] == "arrived\n1\n"
+        assert busy.communicate("gone\n", timeout=500)[0] == "arrived\n1\n"
     assert busy.returncode == 0
 
 
