@@ -238,7 +238,7 @@ class Reading(NamedTuple):
     moment   time by `time.monotonic`
     seconds  since the reading before
     cores    mean number of busy cores since then by name, and of `REST`
-    memory   bytes (PSS) by name; empty if they were not read
+    memory   bytes by name, in which a page that n processes share counts as 1/n (PSS); empty if they were not read
     """
 
     moment: float
@@ -262,29 +262,16 @@ class Usage:
         """Add a reading of groups of process ids; the first call only starts the measurement."""
         is_first, before, self._moment = not self._processes, self._moment, monotonic()
         all_cores = psutil.cpu_percent() / 100 * (psutil.cpu_count() or 1)
-        cores = {name: sum(map(self._cores, pids)) for name, pids in groups.items()}
+        cores, memory = dict.fromkeys(groups, 0.0), dict.fromkeys(groups, 0)
+        with_memory = not is_first and (is_last or self._moment >= self._memory_at)
+        for name, pid in ((name, pid) for name, pids in groups.items() for pid in pids):
+            with suppress(psutil.Error):  # it has just ended
+                process = self._processes.setdefault(pid, psutil.Process(pid))
+                cores[name] += process.cpu_percent() / 100
+                memory[name] += process.memory_full_info().pss if with_memory else 0
         if is_first:
             return
-        memory: dict[str, int] = {}
-        if is_last or self._moment >= self._memory_at:
-            memory = {name: proportional_memory(pids) for name, pids in groups.items()}
+        if with_memory:
             self._memory_at = self._moment + _MEMORY_SECONDS
         cores[REST] = max(0.0, all_cores - sum(cores.values()))
-        self.readings.append(Reading(self._moment, self._moment - before, cores, memory))
-
-    def _cores(self, pid: int) -> float:
-        """Return the busy cores of a process; 0 if it has just ended."""
-        try:
-            self._processes[pid] = self._processes.get(pid) or psutil.Process(pid)
-            return float(self._processes[pid].cpu_percent() / 100)
-        except psutil.Error:
-            return 0.0
-
-
-def proportional_memory(pids: Iterable[int]) -> int:
-    """Return the bytes of these processes (PSS): a page that n processes share counts as 1/n of a page in each."""
-    total = 0
-    for pid in pids:
-        with suppress(psutil.Error):  # it has just ended
-            total += psutil.Process(pid).memory_full_info().pss
-    return total
+        self.readings.append(Reading(self._moment, self._moment - before, cores, memory if with_memory else {}))
