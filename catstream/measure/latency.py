@@ -7,7 +7,7 @@ pipeline does not get better figures by skipping frames while it is slow (no coo
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from threading import Event, Thread
@@ -70,11 +70,11 @@ class Observations:
 
 
 @contextmanager
-def observed(addresses: Sequence[Address], name: str) -> Iterator[list[Observations]]:
-    """Observe one object of each pipeline in threads, which end with the context or with their pipelines."""
-    streams, ended = [Observations() for _ in addresses], Event()
+def observed(address: Address, name: str) -> Iterator[Observations]:
+    """Observe one object of a pipeline in threads, which end with the context or with the pipeline."""
+    observations, ended = Observations(), Event()
 
-    def observe(address: Address, channel: str, observations: Observations) -> None:
+    def observe(channel: str) -> None:
         with subscribe(address, channel, object=name, timeout=_POLL_SECONDS) as messages:
             while not ended.is_set():
                 try:
@@ -86,14 +86,13 @@ def observed(addresses: Sequence[Address], name: str) -> Iterator[list[Observati
                 observations.add(monotonic(), message)
 
     threads = [
-        Thread(target=observe, args=(address, channel, stream), name=f"observer of {channel}", daemon=True)
-        for address, stream in zip(addresses, streams, strict=True)
+        Thread(target=observe, args=(channel,), name=f"observer of {channel}", daemon=True)
         for channel in ("tracks", "models")
     ]
     for thread in threads:
         thread.start()
     try:
-        yield streams
+        yield observations
     finally:
         ended.set()
         for thread in threads:

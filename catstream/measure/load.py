@@ -12,22 +12,25 @@ from catstream.errors import CatstreamError, CommandRejectedError, SilenceError
 from catstream.measure.load_video import Video
 from catstream.pipeline import Pipeline
 
-_STOP_SECONDS = 30.0  # timeout for a pipeline to start, to answer `stop`, and to end after it
+#: Timeout for a pipeline to start, to answer `stop`, and to end after it.
+STOP_SECONDS = 30.0
 
 
 class Stream(threading.Thread):
     """Runs a pipeline until `stop` is called: consumes its tracks and supervises its processes.
 
-    ready : event that is set when the processes are started, so that `address` is set, or the pipeline has failed
+    ready : event that is set when the processes are started, or the pipeline has failed
+    address : of the pipeline, set when it has started
     error : the error of a failed pipeline, else None
     totals : as in `Pipeline`, set at the end
     """
+
+    address: Address
 
     def __init__(self, number: int, url: str, video: Video, settings: Settings) -> None:
         super().__init__(name=f"stream {number}", daemon=True)
         self.number = number
         self.ready = threading.Event()
-        self.address: Address | None = None
         self.error: CatstreamError | None = None
         self.totals: dict[str, int] = {}
         self._url, self._video = url, video
@@ -37,8 +40,8 @@ class Stream(threading.Thread):
     def run(self) -> None:
         try:
             with Pipeline(self._url, self._video.boxes, self._settings, model=self._video.models) as pipeline:
-                self._pipeline = pipeline
                 self.address = Address(pipeline.endpoint, keys=self._settings.run.keys)
+                self._pipeline = pipeline
                 self.ready.set()
                 for _ in pipeline:
                     pass
@@ -57,14 +60,10 @@ class Stream(threading.Thread):
 
     def stop(self) -> None:
         """End the run as if its source had ended; `join` waits until everything learned is stored."""
-        self.ready.wait(_STOP_SECONDS)
-        if self.is_alive() and self.address is not None:
+        self.ready.wait(STOP_SECONDS)
+        if self._pipeline is not None:
             with (
                 suppress(CommandRejectedError, SilenceError),  # it has ended by itself
-                control(self.address, timeout=_STOP_SECONDS) as pipeline,
+                control(self.address, timeout=STOP_SECONDS) as pipeline,
             ):
                 pipeline.stop()
-
-    def join(self, timeout: float | None = _STOP_SECONDS) -> None:
-        """Wait until the pipeline has ended, which may take some seconds."""
-        super().join(timeout)

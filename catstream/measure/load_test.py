@@ -12,11 +12,10 @@ from os import getpid
 from time import monotonic
 from typing import Any
 
-from catstream.client.address import Address
 from catstream.errors import ServiceError, SettingsError, errors_in
 from catstream.measure.camera import Camera, Schedule
 from catstream.measure.latency import Observations, Usage, measure, observed
-from catstream.measure.load import Stream
+from catstream.measure.load import STOP_SECONDS, Stream
 from catstream.measure.load_result import SEARCHES, Limit, Plan, Report, Result, violations
 from catstream.measure.load_video import Video, prepare
 from catstream.measure.subscribers import Subscribers
@@ -110,18 +109,16 @@ def _started(
     def has_begun(stream: Observations) -> bool:
         return bool(stream.tracks) if counts_from_first_track else stream.warmed_up
 
-    addresses: list[Address] = []
     for stream in streams:
         of_all = f"{stream.number + 1} of {len(streams)}"
         stream.start()
         started.append(stream)
         wait_until(stream.ready.is_set, f"starting stream {of_all}")
-        addresses += [stream.address] if stream.address is not None else []
-        observations += stack.enter_context(observed(addresses[-1:], next(iter(video.boxes | video.models))))
+        observations.append(stack.enter_context(observed(stream.address, next(iter(video.boxes | video.models)))))
         wait_until(partial(has_begun, observations[-1]), f"learning the first models of stream {of_all}")
     groups = [
-        Subscribers(plan, number, channel, address)
-        for number, address in enumerate(addresses if plan.subscribers else ())
+        Subscribers(plan, stream.number, channel, stream.address)
+        for stream in (streams if plan.subscribers else ())
         for channel in plan.channels
     ]
     for group in groups:
@@ -131,11 +128,11 @@ def _started(
 
 
 def _stop(streams: list[Stream]) -> None:
-    """Stop all pipelines, and wait until they have ended, which they do concurrently."""
+    """Stop all pipelines, and wait until they have ended, which they do concurrently and within some seconds."""
     for stream in streams:
         stream.stop()
     for stream in streams:
-        stream.join()
+        stream.join(STOP_SECONDS)
 
 
 def _until_the_last_track(

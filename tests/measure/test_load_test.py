@@ -70,7 +70,7 @@ def test_stream_starts_once_the_one_before_has_its_models(monkeypatch):
             events.append("models")
             return True
 
-    monkeypatch.setattr(module, "observed", lambda *_: nullcontext([Observed()]))
+    monkeypatch.setattr(module, "observed", lambda *_: nullcontext(Observed()))
     with ExitStack() as stack:
         video = Video([], [], {"": Box(0, 0, 9, 9)}, {}, np.zeros((1, 4)))
         module._started(Plan(streams=2), [Stream(0), Stream(1)], video, stack, lambda *_: None)
