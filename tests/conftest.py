@@ -81,7 +81,7 @@ def own_places(tmp_path_factory):
         for name, variable in (("run", "XDG_RUNTIME_DIR"), ("tmp", "TMPDIR"), ("state", "XDG_STATE_HOME")):
             (Path(folder) / name).mkdir(mode=0o700)
             patch.setenv(variable, str(Path(folder) / name))
-        patch.setattr(tempfile, "tempdir", None)  # it is read from TMPDIR again
+        patch.setattr(tempfile, "tempdir", os.environ["TMPDIR"])  # read now: a test may change the variable
         yield
 
 
