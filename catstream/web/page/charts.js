@@ -6,8 +6,8 @@ const [FEWEST, SECONDS] = [15, 120]; // minimum and maximum time span of a chart
 const [LEFT, TOP, BOTTOM] = [34, 8, 18];
 
 const CHARTS = [
-  { title: "score", column: 1, least: 1, show: (value) => value.toFixed(2), unit: "" },
-  { title: "frames a second", column: 2, least: 10, show: (value) => value.toFixed(0), unit: "" },
+  { title: "score", column: 2, least: 1, show: (value) => value.toFixed(2), unit: "" },
+  { title: "frames a second", column: 1, least: 10, show: (value) => value.toFixed(0), unit: "" },
   { title: "learning delay", column: 3, least: 0.5, show: (value) => value.toFixed(2), unit: "s" },
   { title: "model version", column: 4, least: 4, show: (value) => value.toFixed(0), unit: "" },
 ];
@@ -41,11 +41,12 @@ export class Charts {
 
   draw() {
     this.section.hidden = !this.rows.length;
-    const points = this.rows.filter((row) => Object.hasOwn(row[2], this.name)).map(([second, rate, { [this.name]: [score, ...more] }]) => [second, score, rate, ...more]);
+    const rows = this.rows.filter(([, , objects]) => Object.hasOwn(objects, this.name));
+    const points = rows.map(([second, rate, objects]) => [second, rate, ...objects[this.name]]);
     for (const chart of this.charts) this.plot(chart, points);
   }
 
-  /** Plot one column of points of [second, score, frames a second, latency, model, present]. */
+  /** Plot one column of points of [second, frames a second, score, latency, model, present]. */
   plot({ drawing, right, column, least, show, unit, title }, all) {
     const points = all.filter((point) => point[column] !== null);
     const values = points.map((point) => point[column]);

@@ -27,10 +27,6 @@ export class Stage {
     element.addEventListener("keydown", (event) => this.key(event));
   }
 
-  get hasPicture() {
-    return this.picture !== null;
-  }
-
   /** Clear the picture, because another pipeline is shown. */
   clear() {
     this.cancel(false);
@@ -110,8 +106,7 @@ export class Stage {
   }
 
   drag(event) {
-    if (event.pointerId !== this.pointer || !this.start || this.asking) return;
-    if (!this.isMoved(event)) return;
+    if (event.pointerId !== this.pointer || !this.start || this.asking || !this.isMoved(event)) return;
     this.begin();
     const { x, y } = this.place(event);
     this.set(Math.min(x, this.start.x), Math.min(y, this.start.y), Math.abs(x - this.start.x), Math.abs(y - this.start.y));
@@ -158,10 +153,11 @@ export class Stage {
   }
 
   key(event) {
-    const { width, height } = this.picture ?? { width: 0, height: 0 };
+    if (!this.picture) return;
+    const { width, height } = this.picture;
     const step = Math.max(1, Math.round(STEP * Math.min(width, height)));
     const arrows = { ArrowLeft: [-step, 0], ArrowRight: [step, 0], ArrowUp: [0, -step], ArrowDown: [0, step] };
-    if (event.key === "Enter" && this.picture) {
+    if (event.key === "Enter") {
       if (this.box) this.accept();
       else {
         this.begin();
@@ -224,12 +220,12 @@ export class Stage {
   /** Write a name above a box, or below its upper side if there is no room. */
   label([x, y], name, colour) {
     const size = TEXT / (this.boxes.getScreenCTM()?.a || 1);
-    const text = make("text", { "font-size": size }, name);
-    const back = make("rect", { class: "name", fill: colour, height: 1.45 * size });
-    this.boxes.append(back, text);
-    const across = text.getComputedTextLength() + 0.8 * size;
-    const [left, top] = [Math.max(0, Math.min(x, this.picture.width - across)), y >= 1.45 * size ? y - 1.45 * size : y];
-    for (const [key, value] of Object.entries({ x: left, y: top, width: across })) back.setAttribute(key, value);
-    for (const [key, value] of Object.entries({ x: left + 0.4 * size, y: top + 1.05 * size })) text.setAttribute(key, value);
+    const text = make("text", { "font-size": size, x: 0.4 * size, y: 1.05 * size }, name);
+    const group = make("g", {}, text);
+    this.boxes.append(group);
+    const [width, height] = [text.getComputedTextLength() + 0.8 * size, 1.45 * size];
+    const [left, top] = [Math.max(0, Math.min(x, this.picture.width - width)), y >= height ? y - height : y];
+    group.setAttribute("transform", `translate(${left} ${top})`);
+    group.prepend(make("rect", { class: "name", fill: colour, width, height }));
   }
 }

@@ -35,7 +35,7 @@ export class StreamPage {
       if (confirm("Stop the pipeline?\n\nEverything learned is stored first. The pipeline cannot be restarted from this page.")) this.send("stop");
     };
     addEventListener("pagehide", () => this.stage.cancel()); // else the pipeline resumes only once its pause is over
-    const sizes = new ResizeObserver(() => { this.stage.draw(); this.charts.draw(); this.trees.redraw(); });
+    const sizes = new ResizeObserver(() => { this.stage.draw(); this.charts.draw(); this.trees.show(); });
     for (const drawn of [$("#stage"), $(".charts"), $(".trees")]) sizes.observe(drawn);
   }
 
@@ -167,7 +167,7 @@ export class StreamPage {
     write($("#state b"), words);
     this.showSource();
     write($("#overlay"), this.overlay());
-    $("#stage").classList.toggle("over", (status.phase === "ended" || status.state === "lost") && stage.hasPicture);
+    $("#stage").classList.toggle("over", Boolean(stage.picture) && (status.phase === "ended" || status.state === "lost"));
     $("#draw").classList.toggle("main", state === "waiting" || state === "absent"); // else there is no need of one
     write($("#pause"), status.paused ? "Resume" : "Pause");
     $("#pause").setAttribute("aria-pressed", String(status.paused));
@@ -206,7 +206,7 @@ export class StreamPage {
     if (silent !== null) return "The server of this page does not answer. This page tries again.";
     if (status.phase === "waiting") return status.reason || "Waiting for a pipeline";
     if (status.phase === "silent") return `The pipeline does not send messages. This page waits for it. The reason: ${status.reason}`;
-    if (!stage.hasPicture) return "Waiting for a picture";
+    if (!stage.picture) return "Waiting for a picture";
     return status.state === "lost" ? `${status.words[0].toUpperCase()}${status.words.slice(1)}: this is the last picture.` : "";
   }
 }

@@ -17,19 +17,16 @@ export class Trees {
   /** Show another object. */
   choose(name) {
     this.name = name;
-    for (const tree of this.trees) tree.leaves = -1;
-    this.show(this.part);
+    this.show();
   }
 
   /** Show the trees of the chosen object, by the table of trees: a figure for each, made when it is first received. */
-  show(part) {
+  show(part = this.part) {
     this.part = part;
     const { leaves = [], rows = 0, bytes = 0 } = part.objects[this.name] ?? {};
     this.kept.textContent = rows ? `${rows.toLocaleString("en")} rows in ${(bytes / 1e6).toFixed(1)} MB.` : "";
     for (const [place, { title, meaning }] of part.kinds.entries()) {
-      const tree = this.trees[place] ??= this.add(title, meaning);
-      const count = leaves[place] ?? 0;
-      if (count !== tree.leaves) this.draw(tree, count);
+      this.draw(this.trees[place] ??= this.add(title, meaning), leaves[place] ?? 0);
     }
   }
 
@@ -37,11 +34,7 @@ export class Trees {
     const parts = figure(this.element, "tree", title);
     parts.left.className = "label";
     add(parts.caption, "small", { textContent: meaning });
-    return { ...parts, leaves: -1 };
-  }
-
-  redraw() {
-    for (const tree of this.trees) if (tree.leaves >= 0) this.draw(tree, tree.leaves);
+    return parts;
   }
 
   draw(tree, count) {
@@ -57,7 +50,6 @@ export class Trees {
     tree.drawing.replaceChildren(...drawn);
     tree.right.textContent = count ? `${many(count, "leaf", "leaves")} in ${many(kept.length, "node")}` : "no leaf yet";
     tree.drawing.setAttribute("aria-label", count ? `levels ${kept.map(({ level }) => level).join(", ")}` : "empty");
-    tree.leaves = count;
   }
 }
 
