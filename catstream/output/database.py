@@ -35,7 +35,6 @@ _TYPES = ", ".join(f"{name} {kind}" for name, kind in COLUMNS.items())
 _CREATE = f"CREATE TABLE IF NOT EXISTS tracks ({_TYPES}, PRIMARY KEY (frame, object)) STRICT"
 _INSERT = f"INSERT OR REPLACE INTO tracks ({_NAMES}) VALUES ({', '.join('?' for _ in COLUMNS)})"
 
-
 #: Frames that wait for a locked database at most.
 _MOST_WAITING = 1 << 16
 

@@ -38,8 +38,6 @@ _KEEPALIVE = 30  # seconds without a message after which client and broker test 
 _REPLY_SECONDS = 10  # in which a broker accepts or refuses a connection
 _ACCEPT_SECONDS = 1.0  # limit for the messages before the last one to arrive
 _EXPIRE_SECONDS = 10  # without a state after which Home Assistant shows a sensor as unavailable, at least
-
-
 _STATES = "{true: 'ON', false: 'OFF'}"  # in a template of Home Assistant
 
 

@@ -32,9 +32,8 @@ class SourceVideo(Sink):
         )
         self._colours = Colours()
         try:
-            aspect = self._frames.pixel_aspect
-            size, rate = drawn_size(self._frames.size), self._frames.rate
-            self._video = VideoWriter(dest, rate, size, pixel_aspect=aspect)
+            size, aspect = drawn_size(self._frames.size), self._frames.pixel_aspect
+            self._video = VideoWriter(dest, self._frames.rate, size, pixel_aspect=aspect)
         except VideoError:
             self._frames.close()
             raise
@@ -76,8 +75,7 @@ class PictureVideo(Sink):
         image = preview_image(picture, tracks, self._colours) if tracks else None
         if image is not None:
             self._colours.keep(track.object for track in tracks)
-            size = (image.shape[1], image.shape[0])
-            self._video = self._video or VideoWriter(self._dest, RATE, size)
+            self._video = self._video or VideoWriter(self._dest, RATE, (image.shape[1], image.shape[0]))
             self._video.write(image, tracks[0].time)
 
     def close(self) -> None:

@@ -9,15 +9,7 @@ from typing import Literal, TypeVar
 
 from catstream.video.drawing import Colours
 from catstream.wire.heads import TREES
-from catstream.wire.messages import (
-    End,
-    Health,
-    Model,
-    Preview,
-    State,
-    Track,
-    run_state,
-)
+from catstream.wire.messages import End, Health, Model, Preview, State, Track, run_state
 
 Key = TypeVar("Key")
 Value = TypeVar("Value")
