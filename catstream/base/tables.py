@@ -9,11 +9,11 @@ from __future__ import annotations
 import csv
 import io
 from codecs import BOM_UTF16_BE, BOM_UTF16_LE
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from math import isfinite
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from catstream.base.files import write_atomically, writing
 from catstream.base.text import listed
@@ -58,11 +58,11 @@ class Row:
             raise ValueError(f"column {column}: expected a whole number, got {self.text(column)!r}")
         return int(number)
 
-    def choice(self, column: str, choices: Mapping[str, _Value]) -> _Value:
-        """The choice of this name."""
+    def choice(self, column: str, choices: Sequence[str]) -> Any:
+        """The text of a value, one of the choices."""
         if (text := self.text(column)) not in choices:
             raise ValueError(f"column {column}: expected {' or '.join(filter(None, choices))}, got {text!r}")
-        return choices[text]
+        return text
 
 
 class Columns:

@@ -49,9 +49,6 @@ from catstream.video.source import open_source
 from catstream.wire.codec import decode_json
 from catstream.wire.messages import Check, State, Track
 
-_STATES: dict[str, State] = {state: state for state in get_args(State)}
-_CHECKS: dict[str, Check] = {check: check for check in get_args(Check)}
-
 #: Stands for the objects of the frame before the first one: an object without a name is written last.
 _FIRST = frozenset({UNNAMED})
 
@@ -391,11 +388,11 @@ def _parse_row(row: Row) -> Track:
     """
     box = Box(*(row.number(side) for side in "xywh")) if row.text("x") else None
     return Track(
-        *(row.integer("frame"), row.number("seconds"), row.choice("state", _STATES), box, row.number("score")),
+        *(row.integer("frame"), row.number("seconds"), row.choice("state", get_args(State)), box, row.number("score")),
         model_version=row.integer("model_version"),
         object=check_name(row.text("object")),
         source_frame=row.integer("source_frame", default=-1),
-        checked=row.choice("checked", _CHECKS),
+        checked=row.choice("checked", get_args(Check)),
         probability=row.number("probability") if row.text("probability") else None,
     )
 
