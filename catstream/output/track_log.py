@@ -223,8 +223,8 @@ def is_log(path: Path) -> bool:
 class Log:
     """A log, from which the tracks of a run are read. It may grow meanwhile.
 
-    A line that was cut at the end of the file counts as not written. VideoError for any other line that is no track,
-    with its number; if `skip_damaged`, such lines are skipped.
+    A line that was cut at the end of the file counts as not written, and blank lines are ignored. VideoError, with its
+    number, for any other line that is no track; if `skip_damaged`, such lines are skipped.
 
     damaged  number of lines that were skipped
     gap      number of frames that the log states as missing
@@ -283,34 +283,25 @@ class Log:
             if self.path.suffix == ".csv" and not file.readline().endswith(b"\n"):  # a crash has cut the names
                 return
             file.seek(0)
-            (start, parse), end, problem, is_cut = self._parser(), 0, "", False
+            (start, parse), end = self._parser(), 0
             for number, line in enumerate(file, 1):
                 end += len(line)
-                if number <= start:
+                if number <= start or not line.strip():
                     continue
-                if problem:
-                    self._report(problem)
-                    problem = ""
                 try:
                     track = parse(line.decode("utf-8-sig"))
                 except ValueError as error:
                     header = Header.from_json(line)
                     if header is not None:  # the first line of a log, a gap, an appended log
                         self.gap += header.gap
-                        continue
-                    problem = f"{self.path}, line {number} is no track ({error})"
-                    is_cut = not line.endswith(b"\n") or not line.strip()
+                    elif line.endswith(b"\n"):  # else a crash has cut the file
+                        if not self._skip:
+                            problem = f"{self.path}, line {number} is no track ({error})"
+                            raise VideoError(f"{problem}: pass --skip-damaged to continue after it") from None
+                        self.damaged += 1
                     continue
                 if track is not None:
                     yield track, end if line.endswith(b"\n") else 0
-        if problem and not is_cut:
-            self._report(problem)
-
-    def _report(self, problem: str) -> None:
-        """Count a damaged line, or raise an error if they are not to be skipped."""
-        if not self._skip:
-            raise VideoError(f"{problem}: pass --skip-damaged to continue after it")
-        self.damaged += 1
 
     def _parser(self) -> tuple[int, Callable[[str], Track | None]]:
         """Return the number of lines before the first track, and the function that parses a line: None if it is empty.

@@ -343,6 +343,14 @@ def test_a_damaged_line_before_the_end_is_an_error_with_its_number_or_skipped(tm
     assert RunFiles(Origin(), None, [str(log)]).position(skip_damaged=True)[0] == 9
 
 
+@pytest.mark.parametrize("name", ["t.ndjson", "t.csv"])
+def test_blank_lines_of_a_log_are_ignored(tmp_path, name):
+    log = tmp_path / name
+    add(RunFiles(Origin(), None, [str(log)]), [[""]] * 3)
+    log.write_bytes(log.read_bytes().replace(b"\n", b"\n\n"))
+    assert [frame.number for frame in Log(log)] == [0, 1, 2]
+
+
 COLUMNS = [
     "frame",
     "seconds",
