@@ -74,7 +74,10 @@ def _rendering(plan: Plan, frames: int, report: Report) -> Video:
             yield image
 
     still, units = [*_encoded(plan, images([0] * _STILL_FRAMES))], [*_encoded(plan, images(range(count)))]
-    boxes = _boxes(plan, cast(Box, truth[0]))  # its object is visible
+    boxes = {"object-1" if plan.objects > 1 else UNNAMED: cast(Box, truth[0])}  # the flower is visible
+    x, y = plan.size[0] / rendered.SIZE[0], plan.size[1] / rendered.SIZE[1]
+    for n in range(plan.objects - 1):  # parts of the lake that stay in the picture
+        boxes[f"object-{n + 2}"] = Box(x * (10 + 80 * (n % 4)), y * (110 + 85 * (n // 4)), 60 * x, 60 * y)
     return Video(units, still, boxes, {}, np.array([truth[number] or (np.nan,) * 4 for number in range(count)]))
 
 
@@ -86,15 +89,6 @@ def _encoded(plan: Plan, images: Iterable[np.ndarray]) -> Iterator[bytes]:
     for image in images:
         yield from map(bytes, encoder.packets(image))
     yield from map(bytes, encoder.flush())
-
-
-def _boxes(plan: Plan, dahlia: Box) -> dict[str, Box]:
-    """The boxes in the first image: the flower, and parts of the lake that stay in the picture."""
-    if plan.objects == 1:
-        return {UNNAMED: dahlia}
-    x, y = plan.size[0] / rendered.SIZE[0], plan.size[1] / rendered.SIZE[1]
-    lake = (Box(x * (10 + 80 * (n % 4)), y * (110 + 85 * (n // 4)), 60 * x, 60 * y) for n in range(plan.objects - 1))
-    return {f"object-{number}": box for number, box in enumerate((dahlia, *lake), 1)}
 
 
 def with_recording(plan: Plan, rate: float | None) -> Plan:
