@@ -55,14 +55,10 @@ def compare(before: dict[str, Any], after: dict[str, Any], tolerance: float) -> 
         raise SettingsError(
             f"the results have different plans: {', '.join(lines)}; repeat one load test like the other"
         )
-    if find:
-        return [_change(f"highest {find}", before["highest"] or 0, after["highest"] or 0, tolerance)]
-    return [
-        _change(name, value, after["figures"].get(name, 0.0), tolerance) for name, value in before["figures"].items()
-    ]
-
-
-def _change(name: str, before: float, after: float, tolerance: float) -> Change:
-    loss = before - after if name == "success" or name.startswith("highest") else after - before
-    worse = loss / before if before else math.copysign(math.inf, loss) if loss else 0.0
-    return Change(name, before, after, worse, worse > tolerance and not name.endswith(("p99.9", "max")))
+    changes = []
+    for name in [f"highest {find}"] if find else before["figures"]:
+        old, new = (each["highest"] or 0 if find else each["figures"].get(name, 0.0) for each in (before, after))
+        loss = old - new if find or name == "success" else new - old
+        worse = loss / old if old else math.copysign(math.inf, loss) if loss else 0.0
+        changes.append(Change(name, old, new, worse, worse > tolerance and not name.endswith(("p99.9", "max"))))
+    return changes
