@@ -138,7 +138,7 @@ class Measures:
 
 @dataclass(slots=True)
 class Receipts:
-    """The measures of the fast subscribers to one channel of a stream.
+    """The measures of the fast subscribers to one channel of a stream, at least one.
 
     latency   seconds from the due time of each frame to the receipt of a message of this frame or a newer one; at most
               to the end of the run; float32 (subscribers, frames)
@@ -155,9 +155,7 @@ class Receipts:
 
     @property
     def figures(self) -> dict[str, float]:
-        """The figures that can have a limit, by name; none without fast subscribers."""
-        if not self.received:
-            return {}
+        """The figures that can have a limit, by name."""
         latencies = {f"subscriber-{name}": seconds for name, seconds in percentiles(self.latency).items()}
         return latencies | {"subscriber-missed": sum(self.missed) / max(1, sum(self.missed) + sum(self.received))}
 

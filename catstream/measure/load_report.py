@@ -57,9 +57,8 @@ def tables(result: Result) -> Iterator[Table]:
         "messages that were not in the coreset trees at the end. Success: share of frames with an IoU above 0.5 with "
         f"the {'unloaded run' if result.plan.video else 'ground truth'}; a skipped frame has the last box.",
     )
-    if result.readings:
-        processes = [{"process": name, **_cost(cores, result.memory.get(name))} for name, cores in result.cores.items()]
-        yield Table("Processes", processes, "MB: as above (PSS), at the end of the run.")
+    processes = [{"process": name, **_cost(cores, result.memory.get(name))} for name, cores in result.cores.items()]
+    yield Table("Processes", processes, "MB: as above (PSS), at the end of the run.")
     if result.subscribers:
         subscribers = [
             {
@@ -67,10 +66,10 @@ def tables(result: Result) -> Iterator[Table]:
                 "stream": str(receipts.stream),
                 "fast": str(len(receipts.received)),
                 "slow": str(result.plan.slow_subscribers),
-                **{name: milliseconds(receipts.figures.get(f"subscriber-{name}")) for name in PERCENTILES},
-                "p99, slowest": milliseconds(max((percentiles(row)["p99"] for row in receipts.latency), default=None)),
+                **{name: milliseconds(seconds) for name, seconds in percentiles(receipts.latency).items()},
+                "p99, slowest": milliseconds(max(percentiles(row)["p99"] for row in receipts.latency)),
                 "missed": str(sum(receipts.missed)),
-                "missed, most": str(max(receipts.missed, default=0)),
+                "missed, most": str(max(receipts.missed)),
             }
             for receipts in result.subscribers
         ]
@@ -116,21 +115,21 @@ def write_raw(path: Path, result: Result) -> None:
 
     def rows() -> Iterator[tuple[object, ...]]:
         for number, stream in enumerate(result.streams):
-            receipts = [each for each in result.subscribers if each.stream == number]
-            own = [("tracks", "", stream.track), ("models", "", stream.model)]
-            extra = [(each.channel, str(index), row) for each in receipts for index, row in enumerate(each.latency)]
-            texts = [f"{moment:.6f}" for moment in stream.due - result.streams[0].due[0]]
-            for channel, subscriber, latency in (*own, *extra):
-                for frame, values in enumerate(zip(texts, map(int, stream.tracked), latency, strict=True)):
-                    yield number, channel, subscriber, frame, *values[:2], f"{values[2]:.6f}"
+            latencies = [("tracks", "", stream.track), ("models", "", stream.model)]
+            for each in result.subscribers:
+                if each.stream == number:
+                    latencies += [(each.channel, str(index), row) for index, row in enumerate(each.latency)]
+            texts = [f"{due:.6f}" for due in stream.due - result.streams[0].due[0]]
+            frames = [*zip(range(len(texts)), texts, map(int, stream.tracked), strict=True)]
+            for channel, subscriber, latency in latencies:
+                for frame, seconds in zip(frames, latency, strict=True):
+                    yield number, channel, subscriber, *frame, f"{seconds:.6f}"
 
     heads = ("stream", "channel", "subscriber", "frame", "due_seconds", "tracked", "latency_seconds")
     write_table(path, heads, rows())
 
 
-def milliseconds(seconds: float | None) -> str:
-    if seconds is None:
-        return "-"
+def milliseconds(seconds: float) -> str:
     return f"{1000 * seconds:.3g}" if seconds < 1 else f"{1000 * seconds:.0f}"
 
 
@@ -194,7 +193,7 @@ def to_json(load_test: LoadTest, provenance: dict[str, object]) -> dict[str, obj
         "subscribers": [
             {
                 **{name: getattr(receipts, name) for name in ("stream", "channel", "received", "missed")},
-                "latency": percentiles(receipts.latency) if receipts.received else {},
+                "latency": percentiles(receipts.latency),
             }
             for receipts in result.subscribers
         ],
@@ -226,7 +225,7 @@ def _figures(result: Result) -> dict[str, float]:
 def write_report(path: Path, load_test: LoadTest, provenance: dict[str, object]) -> Path:
     """Write the report of the decisive run, and of the steps of a search."""
     result, timeline = load_test.result, load_test.result.timeline
-    has_chart = bool(result.readings) and len(timeline["seconds"]) > 1
+    has_chart = len(timeline["seconds"]) > 1
     verdicts = [(verdict(load_test), load_test.sustained is not False)]
     verdicts += [(error, False) for error in result.errors]
     verdicts += [(limit.describe(result), limit.is_met(result)) for limit in load_test.limits]
@@ -255,12 +254,9 @@ def verdict(load_test: LoadTest) -> str:
     if load_test.find and load_test.highest:
         is_least = load_test.interrupted or load_test.highest == SEARCHES[load_test.find]
         start = "Interrupted" if load_test.interrupted else "Sustained"
-        most, number, (cores, memory) = (
-            "least" if is_least else "most",
-            result.plan.number(load_test.find),
-            result.mean_cost,
-        )
-        return f"{start}: at {most} {number}: {result.plan}; a stream takes {cores:.2f} cores, {memory / 1e6:.0f} MB."
+        number = f"at {'least' if is_least else 'most'} {result.plan.number(load_test.find)}"
+        cores, memory = result.mean_cost
+        return f"{start}: {number}: {result.plan}; a stream takes {cores:.2f} cores, {memory / 1e6:.0f} MB."
     if load_test.interrupted:
         return f"Interrupted after {result.seconds:.1f} s: no verdict on {result.plan}."
     reasons = [limit.name for limit in load_test.limits if not limit.is_met(result)]

@@ -103,6 +103,10 @@ class Plan:
         return f"{self.rate:g} frames/s" if name == "rate" else counted(getattr(self, name), name.removesuffix("s"))
 
     @property
+    def fast_subscribers(self) -> int:
+        return self.subscribers - self.slow_subscribers
+
+    @property
     def frames(self) -> int:
         return round(self.rate * self.duration)
 
@@ -167,7 +171,7 @@ class Result:
     @property
     def memory(self) -> dict[str, int]:
         """Bytes of each process at the end, in which a shared page counts in proportion (PSS)."""
-        return self.readings[-1].memory if self.readings else {}
+        return self.readings[-1].memory
 
     def cost(self, number: int) -> tuple[float, int]:
         """Return the processor seconds per second, and the bytes of memory, of the processes of a stream."""
@@ -183,7 +187,7 @@ class Result:
     @property
     def other_load(self) -> float:
         """Mean number of cores that were busy with processes outside the load test."""
-        return self.cores.get(REST, 0.0)
+        return self.cores[REST]
 
 
 @dataclass(frozen=True, slots=True)

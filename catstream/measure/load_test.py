@@ -64,7 +64,7 @@ def run(plan: Plan, video: Video, report: Report) -> Result:
         due = [min(plan.frames, schedule.following(end)) if interrupted else plan.frames for schedule in schedules]
         if min(due) <= 0:
             raise KeyboardInterrupt
-        subscribers = [group.receipts(observations, schedules, due, end) for group in groups]
+        subscribers = [group.receipts(observations, schedules, due, end) for group in groups if plan.fast_subscribers]
     return Result(
         plan=plan,
         seconds=min(due) / plan.rate,
@@ -208,7 +208,7 @@ def run_load_test(
     find : search for the highest number of this parameter that meets the limits, beginning with the one in the plan
     report, done : functions that are called with the progress, and after each run
     """
-    has_fast = find == "subscribers" or plan.subscribers > plan.slow_subscribers
+    has_fast = plan.fast_subscribers or find == "subscribers"
     if not has_fast and any(limit.name.startswith("subscriber-") for limit in limits):
         raise SettingsError("a limit of subscribers requires fast ones: raise --subscribers, or omit the limit")
     load_test = LoadTest(limits, find)

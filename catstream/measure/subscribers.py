@@ -40,8 +40,7 @@ class Subscribers:
         self._processes: list[Any] = []
         self._fast: list[Connection] = []  # pipes to processes of fast subscribers
         self._slow: list[Connection] = []
-        slow = plan.slow_subscribers
-        for total, pipes in ((plan.subscribers - slow, self._fast), (slow, self._slow)):
+        for total, pipes in ((plan.fast_subscribers, self._fast), (plan.slow_subscribers, self._slow)):
             for first in range(0, total, _PER_PROCESS):
                 pipe, other = SPAWN.Pipe()
                 is_slow, count = pipes is self._slow, min(_PER_PROCESS, total - first)

@@ -44,8 +44,7 @@ def timeline(
     # Step 1: latencies, at the load test and at its subscribers; and frames.
     latencies = {"": [(stream.due, stream.track) for stream in streams]}
     for each in subscribers:
-        if each.received:
-            latencies.setdefault(f"{each.channel}-", []).append((streams[each.stream].due, each.latency))
+        latencies.setdefault(f"{each.channel}-", []).append((streams[each.stream].due, each.latency))
     figures: dict[str, list[float]] = {"seconds": seconds.tolist()}
     for prefix, measured in latencies.items():
         rows = [percentiles(values) for values in by_interval(measured)]
@@ -58,12 +57,13 @@ def timeline(
     def of_pipelines(amounts: Mapping[str, float]) -> float:
         return sum(amount for name, amount in amounts.items() if name[-1].isdigit())  # the number of the stream
 
-    if readings:
-        moments = [reading.moment for reading in readings]
-        cores = np.array([(of_pipelines(each.cores), sum(each.cores.values()), each.cores[REST]) for each in readings])
-        cores[:, 1] -= cores[:, 0] + cores[:, 2]
-        for name, values in zip(("cores", "load_cores", "other_cores"), cores.T, strict=True):
-            figures[name] = np.interp(start + seconds + interval, moments, values).tolist()
-        memory = [(reading.moment, of_pipelines(reading.memory)) for reading in readings if reading.memory]
-        figures["memory"] = np.interp(start + seconds + interval, *np.transpose(memory)).tolist()
-    return figures
+    amounts = {
+        "cores": [(each.moment, of_pipelines(each.cores)) for each in readings],
+        "load_cores": [
+            (each.moment, sum(each.cores.values()) - of_pipelines(each.cores) - each.cores[REST]) for each in readings
+        ],
+        "other_cores": [(each.moment, each.cores[REST]) for each in readings],
+        "memory": [(each.moment, of_pipelines(each.memory)) for each in readings if each.memory],
+    }
+    ends = start + seconds + interval
+    return figures | {name: np.interp(ends, *np.transpose(rows)).tolist() for name, rows in amounts.items()}

@@ -9,7 +9,7 @@ import pytest
 from catstream.base.box import Box
 from catstream.measure.camera import Schedule
 from catstream.measure.datasets import Sequence, find_sequences
-from catstream.measure.latency import Measures
+from catstream.measure.latency import REST, Measures, Reading
 from catstream.measure.load_result import Plan, Result
 from catstream.wire.messages import Track
 
@@ -44,7 +44,8 @@ def result() -> Callable[..., Result]:
             frames = np.arange(len(seconds))
             seen = {"due": 100 + frames / 10, "tracked": frames < tracked * len(seconds)}
             measures.append(Measures(**seen, track=seconds, model=seconds, success=success))
-        facts = {"readings": [], "subscribers": [], "camera_late": 0.001}
+        readings = [Reading(105.0, 5.0, {"detector 0": 0.5, REST: 0.1}, {"detector 0": 10**8})]
+        facts = {"readings": readings, "subscribers": [], "camera_late": 0.001}
         return Result(Plan(streams=len(streams)), 10.0, measures, **{**facts, **others})
 
     return made

@@ -32,6 +32,7 @@ def test_each_second_has_the_figures_of_its_frames():
 )
 def test_intervals_are_longer_in_a_long_run_or_at_a_low_rate(rate, seconds, intervals, length):
     due = 12345.678 + np.arange(round(rate * seconds)) / rate
-    figures = timeline(rate, [Measures(due, due > 0, due * 0, due * 0, 0.9)], [], [])
+    readings = [Reading(due[-1], seconds, {REST: 0.5}, {"detector 0": 1000})]
+    figures = timeline(rate, [Measures(due, due > 0, due * 0, due * 0, 0.9)], [], readings)
     assert (len(figures["seconds"]), figures["seconds"][1]) == (intervals, length)
     assert figures["p99"] == [0] * intervals
