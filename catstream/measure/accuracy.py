@@ -54,9 +54,6 @@ class Row:
         shares = _share(score.noticed, score.absent), _share(score.false, score.present)
         return [self.name, str(self.frames), *(f"{value:.3f}" for value in measures), *shares, f"{self.fps:.0f}"]
 
-    def to_dict(self) -> dict[str, object]:
-        return {"name": self.name, "frames": self.frames, **asdict(self.score), "fps": self.fps}
-
 
 def _share(part: int, whole: int) -> str:
     if not whole:
@@ -66,12 +63,10 @@ def _share(part: int, whole: int) -> str:
 
 def to_json(rows: Sequence[Row], settings: Settings) -> dict[str, object]:
     """Return the JSON of `catstream evaluate --json`: version, changed settings, rows and mean."""
-    return {
-        "version": version("catstream"),
-        "settings": settings.changed(),
-        "sequences": [row.to_dict() for row in rows],
-        "mean": Row.mean(rows).to_dict(),
-    }
+    *sequences, mean = (
+        {"name": row.name, "frames": row.frames, **asdict(row.score), "fps": row.fps} for row in (*rows, Row.mean(rows))
+    )
+    return {"version": version("catstream"), "settings": settings.changed(), "sequences": sequences, "mean": mean}
 
 
 def write_report(path: Path, runs: Sequence[Run], settings: Settings, errors: Sequence[CatstreamError] = ()) -> Path:
