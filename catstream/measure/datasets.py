@@ -30,6 +30,7 @@ import numpy as np
 from catstream.base.arrays import Bool, Float64, UInt8
 from catstream.base.text import counted
 from catstream.errors import VideoError
+from catstream.measure.scores import present
 from catstream.video.images import natural_order
 from catstream.video.source import open_source
 
@@ -68,8 +69,7 @@ class Sequence:
     @property
     def present(self) -> Bool:
         """Whether each frame shows the object, bool (frames,)."""
-        present: Bool = np.all(np.isfinite(self.boxes), axis=1)
-        return present
+        return present(self.boxes)
 
     def since(self, frame: int) -> Sequence:
         """Return the part from a frame on, under the same name."""
@@ -102,34 +102,27 @@ def find_sequences(*paths: str | Path, failed: Callable[[VideoError], None] | No
     failed : function that is called with the error of each sequence that cannot be read, while the others are; if None,
         the error is raised
     """
-    sequences: dict[Path, Sequence | None] = {}  # by the file of the ground truth
+    truths: dict[Path, _Truth] = {}  # by the file
     for path in map(Path, paths):
-        truths = [truth for folder in _folders(path) for truth in _truths(folder)]
-        if not truths:
+        folders = sorted(path.glob("[!.]*/"), key=natural_order)
+        found = _truths(path) or [truth for folder in folders for truth in _truths(folder)]
+        if not found:
             raise VideoError(
                 f"there is no annotated sequence in {str(path)!r}: expected a folder of frames with "
                 "groundtruth_rect.txt (x,y,w,h), gt.txt (TLD), groundtruth.txt (VOT, LaSOT, GOT-10k) or FOLDER.txt "
                 "(Princeton), or a folder of such folders"
             )
-        for truth in truths:
-            if (file := truth.file.resolve()) in sequences:
-                continue
-            sequences[file] = None
-            try:
-                sequences[file] = _sequence(truth)
-            except VideoError as error:
-                if failed is None:
-                    raise
-                failed(error)
-    return [sequence for sequence in sequences.values() if sequence is not None]
-
-
-def _folders(path: Path) -> list[Path]:
-    """Return the folder of a sequence itself, or the folders in a folder."""
-    if _truths(path) or not path.is_dir():
-        return [path]
-    inner = (inner for inner in path.iterdir() if not inner.name.startswith("."))
-    return sorted((folder for folder in inner if folder.is_dir()), key=natural_order)
+        for truth in found:
+            truths.setdefault(truth.file.resolve(), truth)
+    sequences = []
+    for truth in truths.values():
+        try:
+            sequences.append(_sequence(truth))
+        except VideoError as error:
+            if failed is None:
+                raise
+            failed(error)
+    return sequences
 
 
 class _Layout(NamedTuple):
@@ -202,11 +195,11 @@ def _sequence(truth: _Truth) -> Sequence:
     except ValueError as error:
         raise VideoError(f"{str(file)!r}: {error}") from None
     boxes[_absent(folder, len(boxes))] = np.nan
-    boxes[~(np.isfinite(boxes).all(axis=1) & (boxes[:, 2:] > 0).all(axis=1))] = np.nan
+    boxes[~present(boxes) | (boxes[:, 2:] <= 0).any(axis=1)] = np.nan
     sequence = Sequence(name, folder, boxes, _FIRST_FRAMES.get((name.lower(), len(boxes)), 0))
-    if (present := sequence.present.sum()) < 2:  # a run starts with the initial box
+    if (count := sequence.present.sum()) < 2:  # a run starts with the initial box
         raise VideoError(
-            f"{str(file)!r} has {'one box' if present else 'no box'}: expected a line with {layout.line} for each "
+            f"{str(file)!r} has {'one box' if count else 'no box'}: expected a line with {layout.line} for each "
             "frame, and the object in at least two frames"
         )
     return sequence

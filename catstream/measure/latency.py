@@ -23,7 +23,7 @@ from catstream.client.attach import subscribe
 from catstream.errors import SilenceError
 from catstream.measure.camera import Schedule
 from catstream.measure.rtsp import due_time
-from catstream.measure.scores import overlaps
+from catstream.measure.scores import overlaps, present
 from catstream.wire.messages import Model, Track
 
 #: The percentiles of latencies that are reported, by name.
@@ -188,7 +188,7 @@ def measure(
     period = images or len(truth)
     once, numbers = len(truth) - period, np.arange(frames)
     true = truth[np.where(numbers < once, numbers, once + (numbers - once) % period)]
-    is_success = overlaps(boxes[last], true)[np.isfinite(true).all(axis=1)] > _SUCCESS
+    is_success = overlaps(boxes[last], true)[present(true)] > _SUCCESS
     models = [(moment, schedule.number(newest)) for moment, newest in observations.models]
     return Measures(
         due=due,

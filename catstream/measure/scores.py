@@ -45,6 +45,11 @@ class Score:
     false: int
 
 
+def present(boxes: Float64) -> Bool:
+    """Return whether each row has a box, bool (frames,); it has none if a number is NaN."""
+    return np.asarray(np.isfinite(boxes).all(axis=1))
+
+
 def overlaps(boxes: Float64, truth: Float64) -> Float64:
     """Return the intersection over union of each pair of rows, float64 (frames, 4) both; 0 if either is NaN.
 
@@ -56,8 +61,7 @@ def overlaps(boxes: Float64, truth: Float64) -> Float64:
     shared = np.prod(np.maximum(high - low, 0), axis=1)
     union = np.prod(boxes[:, 2:], axis=1) + np.prod(truth[:, 2:], axis=1) - shared
     ratios = np.divide(shared, union, out=np.zeros(len(boxes)), where=union > 0)
-    shares: Float64 = np.minimum(np.nan_to_num(ratios), 1.0)  # rounding may exceed 1
-    return shares
+    return np.asarray(np.minimum(np.nan_to_num(ratios), 1.0))  # rounding may exceed 1
 
 
 def distances(boxes: Float64, truth: Float64, *, normalised: bool = False) -> Float64:
@@ -73,14 +77,12 @@ def distances(boxes: Float64, truth: Float64, *, normalised: bool = False) -> Fl
 
 def success_plot(boxes: Float64, truth: Float64) -> Float64:
     """Return the share of frames with the object whose overlap exceeds each of `OVERLAPS`, float64 (21,)."""
-    shares: Float64 = (overlaps(boxes, truth)[_present(truth), None] > OVERLAPS).mean(axis=0)
-    return shares
+    return np.asarray((overlaps(boxes, truth)[present(truth), None] > OVERLAPS).mean(axis=0))
 
 
 def precision_plot(boxes: Float64, truth: Float64) -> Float64:
     """Return the share of frames with the object whose centre error is at most each of `PIXELS`, float64 (51,)."""
-    shares: Float64 = (distances(boxes, truth)[_present(truth), None] <= PIXELS).mean(axis=0)
-    return shares
+    return np.asarray((distances(boxes, truth)[present(truth), None] <= PIXELS).mean(axis=0))
 
 
 def score(boxes: Float64, truth: Float64) -> Score:
@@ -88,21 +90,16 @@ def score(boxes: Float64, truth: Float64) -> Score:
 
     boxes, truth : float64 (frames, 4), x, y, w, h in pixels, NaN if there is no box
     """
-    present, reported = _present(truth), _present(boxes)
+    shown, reported = present(truth), present(boxes)
     success = success_plot(boxes, truth)
-    off = distances(boxes, truth, normalised=True)[present]
+    off = distances(boxes, truth, normalised=True)[shown]
     return Score(
         auc=float(success.mean()),
         success=float(success[10]),
         precision=float(precision_plot(boxes, truth)[20]),
         normalised_precision=float((off[:, None] <= _SHARES).mean()),
-        absent=int((~present).sum()),
-        noticed=int((~present & ~reported).sum()),
-        present=int(present.sum()),
-        false=int((present & ~reported).sum()),
+        absent=int((~shown).sum()),
+        noticed=int((~shown & ~reported).sum()),
+        present=int(shown.sum()),
+        false=int((shown & ~reported).sum()),
     )
-
-
-def _present(boxes: Float64) -> Bool:
-    present: Bool = np.all(np.isfinite(boxes), axis=1)
-    return present
