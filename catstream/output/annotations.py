@@ -131,10 +131,9 @@ def write_cvat(frames: Iterable[TrackedFrame], path: Path, about: About) -> str:
     note = "" if about.frames else "the video was not read: its last frame is assumed to be the last tracked one"
     end = about.frames or end
     checked = any(place.track.checked for places in objects.values() for place in places)
-    labels = (_CVAT_LABEL.format(escape(name), _CVAT_CHECKED if checked else "") for name in _numbers(frames, about))
+    kinds = (_CVAT_LABEL.format(escape(name), _CVAT_CHECKED if checked else "") for name in _numbers(frames, about))
     with path.open("w", encoding="utf-8") as file:
-        kinds = "\n".join(labels)
-        file.write(_CVAT_HEAD.format(name=escape(about.name), frames=end, labels=kinds, **_size(about)))
+        file.write(_CVAT_HEAD.format(name=escape(about.name), frames=end, labels="\n".join(kinds), **_size(about)))
         for number, places in objects.items():
             file.write(f'<track id="{number - 1}" label="{escape(places[0].label)}" source="auto">\n')
             following = [*(place.track.source_frame for place in places[1:]), end]

@@ -170,9 +170,8 @@ class MqttSink(Sink):
         """Have Home Assistant make the sensors of an object, or remove them if it has ended."""
         state, label = self._state_topic(name), name or "object"
         sensors = {label: "value_json.present"}
-        sensors |= {
-            f"{label} in {zone}": f"value_json.present and '{zone}' in value_json.zones" for zone in self._options.zone
-        }
+        for zone in self._options.zone:
+            sensors[f"{label} in {zone}"] = f"value_json.present and '{zone}' in value_json.zones"
         for sensor, condition in sensors.items():
             number = _id(state + condition)
             config = {

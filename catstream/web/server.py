@@ -197,9 +197,8 @@ class Guard:
         token = in_url or (in_header if kind.lower() == "bearer" else None)
         digest = request.cookies.get(cookie, "") if token is None else _digest(token.strip())
         if hmac.compare_digest(digest.encode(), self._token_digest.encode()):
-            return (
-                _enter(request, cookie, digest) if in_url and path.endswith("/") and request.method == "GET" else None
-            )
+            opens_page = in_url and path.endswith("/") and request.method == "GET"
+            return _enter(request, cookie, digest) if opens_page else None
         if path.endswith("/") and token is None:
             return FileResponse(_LOGIN_PAGE, 401)
         expected = "a token is needed: Authorization: Bearer TOKEN, or ?token=TOKEN"

@@ -6,10 +6,10 @@ const [FEWEST, SECONDS] = [15, 120]; // minimum and maximum time span of a chart
 const [LEFT, TOP, BOTTOM] = [34, 8, 18];
 
 const CHARTS = [
-  { title: "score", column: 2, least: 1, show: (value) => value.toFixed(2), unit: "" },
-  { title: "frames a second", column: 1, least: 10, show: (value) => value.toFixed(0), unit: "" },
-  { title: "learning delay", column: 3, least: 0.5, show: (value) => value.toFixed(2), unit: "s" },
-  { title: "model version", column: 4, least: 4, show: (value) => value.toFixed(0), unit: "" },
+  { title: "score", column: 2, least: 1, show: (value) => value.toFixed(2) },
+  { title: "frames a second", column: 1, least: 10, show: (value) => value.toFixed(0) },
+  { title: "learning delay", column: 3, least: 0.5, show: (value) => `${value.toFixed(2)} s` },
+  { title: "model version", column: 4, least: 4, show: (value) => value.toFixed(0) },
 ];
 
 export class Charts {
@@ -47,11 +47,11 @@ export class Charts {
   }
 
   /** Plot one column of points of [second, frames a second, score, latency, model, present]. */
-  plot({ drawing, right, column, least, show, unit, title }, all) {
+  plot({ drawing, right, column, least, show, title }, all) {
     const points = all.filter((point) => point[column] !== null);
     const values = points.map((point) => point[column]);
     const now = this.rows.at(-1)?.[0];
-    right.textContent = points.at(-1)?.[0] === now && now !== undefined ? `${show(values.at(-1))}${unit && ` ${unit}`}` : "–";
+    right.textContent = points.at(-1)?.[0] === now && now !== undefined ? show(values.at(-1)) : "–";
     drawing.replaceChildren();
     drawing.setAttribute("aria-label", `${title}: ${right.textContent}`);
     if (!all.length) return;

@@ -64,14 +64,10 @@ export class StreamPage {
   }
 
   /** Send a command; returns the answer, or null if it was rejected, after showing the reason. */
-  async send(verb, more) {
-    const answer = await this.command(verb, more);
+  async send(verb, fields = {}) {
+    const answer = await post("control", { verb, ...fields });
     this.showMessage(answer.reason, !answer.done);
     return answer.done ? answer : null;
-  }
-
-  command(verb, more = {}) {
-    return post("control", { verb, ...more });
   }
 
   /**
@@ -80,7 +76,7 @@ export class StreamPage {
    * itself if this page does not renew it. Another pause, which the user or another program has begun, stays.
    */
   async hold() {
-    if ((this.status.skipped ?? null) !== null) return { frame: -1, time: this.stage.picture.time, leave: null };
+    if (this.isLive) return { frame: -1, time: this.stage.picture.time, leave: null };
     await this.left; // the pause of a box that was cancelled just now
     if (this.status.state === "waiting") return { frame: Infinity, leave: null };
     const answer = await this.send("pause", { seconds: PAUSE.seconds });
@@ -97,7 +93,7 @@ export class StreamPage {
 
   /** Renew the pause, unless the pipeline has continued after this frame: the picture is another one by then. */
   async renew(frame) {
-    const answer = await this.command("pause", { seconds: PAUSE.seconds });
+    const answer = await post("control", { verb: "pause", seconds: PAUSE.seconds });
     if (!answer.done || answer.frame === frame || !this.stage.drawing || this.stage.asking) return;
     this.stage.cancel();
     await this.left;
@@ -174,6 +170,11 @@ export class StreamPage {
     for (const button of [$("#draw"), $("#pause"), $("#stop")]) button.disabled = !running;
   }
 
+  /** Whether the source is live: the detector counts frames that it skips. */
+  get isLive() {
+    return (this.status.skipped ?? null) !== null;
+  }
+
   /** The state of the pipeline for its colour, and in words. */
   state(running) {
     const { status, server, objects: { list } } = this;
@@ -190,7 +191,7 @@ export class StreamPage {
     const { source = "", endpoint, skipped } = this.status;
     const last = source.includes("://") ? source : source.split("/").filter(Boolean).at(-1) || source;
     const shown = [this.name, /^\d+$/.test(last) ? `camera ${last}` : last || (this.name ? "" : endpoint)].filter(Boolean).join(", ");
-    write($("#source"), shown && `${shown}${(skipped ?? null) === null ? "" : `, ${skipped} frames skipped`}`);
+    write($("#source"), shown && `${shown}${this.isLive ? `, ${skipped} frames skipped` : ""}`);
     $("#source").title = source && endpoint ? `${source}, tracked by the pipeline at ${endpoint}` : "";
     document.title = shown ? `${this.name || shown} – catstream` : "catstream";
   }
