@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import re
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -46,20 +44,16 @@ class _LoadTest(click.Group):
     """Exits with 2 if the arguments are invalid, because 1 states that the load was not sustained."""
 
     def make_context(self, *arguments: Any, **options: Any) -> click.Context:
-        with _usage_errors(CatstreamError):
+        try:
             return super().make_context(*arguments, **options)
+        except CatstreamError as error:
+            raise click.UsageError(str(error)) from None
 
     def invoke(self, context: click.Context) -> Any:
-        with _usage_errors(SettingsError, BoxError, ObjectError, VideoError):
+        try:
             return super().invoke(context)
-
-
-@contextmanager
-def _usage_errors(*kinds: type[CatstreamError]) -> Iterator[None]:
-    try:
-        yield
-    except kinds as error:
-        raise click.UsageError(str(error)) from None
+        except (SettingsError, BoxError, ObjectError, VideoError) as error:
+            raise click.UsageError(str(error)) from None
 
 
 @click.group(cls=_LoadTest, invoke_without_command=True)
