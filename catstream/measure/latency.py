@@ -121,10 +121,6 @@ class Measures:
     totals: dict[str, int] = field(default_factory=dict)
 
     @property
-    def frames(self) -> int:
-        return len(self.due)
-
-    @property
     def skipped(self) -> float:
         """Share of frames without a track of their own."""
         return 1 - float(self.tracked.mean())

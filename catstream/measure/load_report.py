@@ -22,7 +22,7 @@ class Table(NamedTuple):
 
     title: str
     rows: list[dict[str, str]]
-    note: str = ""
+    note: str
 
     @property
     def heads(self) -> list[str]:
@@ -176,7 +176,7 @@ def to_json(load_test: LoadTest, provenance: dict[str, object]) -> dict[str, obj
         "streams": [
             {
                 **dict(zip(("cores", "memory"), result.cost(number), strict=True)),
-                "frames": stream.frames,
+                "frames": len(stream.due),
                 "frames_per_second": result.rate(stream.skipped),
                 "skipped": stream.skipped,
                 "track": percentiles(stream.track),

@@ -64,13 +64,14 @@ def run(plan: Plan, video: Video, report: Report) -> Result:
         due = [min(plan.frames, schedule.following(end)) if interrupted else plan.frames for schedule in schedules]
         if min(due) <= 0:
             raise KeyboardInterrupt
-        subscribers = [group.receipts(observations, schedules, due, end) for group in groups if plan.fast_subscribers]
+        frames = [*zip(observations, schedules, due, strict=True)]
+        fast = groups if plan.fast_subscribers else []
+        subscribers = [group.receipts(*frames[group.stream], end) for group in fast]
     return Result(
         plan=plan,
         seconds=min(due) / plan.rate,
         streams=[
-            measure(observation, schedule, number, video.truth, end, stream.totals, len(video.units))
-            for observation, schedule, number, stream in zip(observations, schedules, due, streams, strict=True)
+            measure(*frames[stream.number], video.truth, end, stream.totals, len(video.units)) for stream in streams
         ],
         readings=usage.readings,
         subscribers=subscribers,

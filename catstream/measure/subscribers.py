@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from array import array
-from collections.abc import Sequence
 from contextlib import ExitStack
 from multiprocessing.connection import Connection
 from selectors import EVENT_READ, DefaultSelector
@@ -36,7 +35,7 @@ class Subscribers:
     """
 
     def __init__(self, plan: Plan, stream: int, channel: str, address: Address) -> None:
-        self._stream, self._channel = stream, channel
+        self.stream, self._channel = stream, channel
         self._processes: list[Any] = []
         self._fast: list[Connection] = []  # pipes to processes of fast subscribers
         self._slow: list[Connection] = []
@@ -57,16 +56,10 @@ class Subscribers:
         """True if each subscriber has received a message."""
         return all(pipe.poll() for pipe in self._fast + self._slow)
 
-    def receipts(
-        self, streams: Sequence[Observations], schedules: Sequence[Schedule], due: Sequence[int], end: float
-    ) -> Receipts:
-        """Wait for the end of the pipeline, and return the measures of the fast subscribers.
-
-        The parameters are those of `measure`, for all streams.
-        """
-        schedule = schedules[self._stream]
-        times, latency, received, missed = schedule.due_times(due[self._stream]), [], [], []
-        numbers = {track.frame: schedule.number(track.pts or 0.0) for _, track in streams[self._stream].tracks}
+    def receipts(self, observations: Observations, schedule: Schedule, frames: int, end: float) -> Receipts:
+        """Wait for the end of the pipeline, and return the measures of the fast subscribers; see `measure`."""
+        times, latency, received, missed = schedule.due_times(frames), [], [], []
+        numbers = {track.frame: schedule.number(track.pts or 0.0) for _, track in observations.tracks}
         deadline = monotonic() + _DRAIN_SECONDS * (End in PUBLIC[self._channel].messages)
         for pipe in self._fast:
             pipe.recv()  # it is connected
@@ -81,7 +74,7 @@ class Subscribers:
                 latency.append(latencies_to_answer(times, answers, end).astype(np.float32))
                 received.append(len(receipts[0]))
                 missed.append(gaps)
-        return Receipts(self._stream, self._channel, np.array(latency), received, missed)
+        return Receipts(self.stream, self._channel, np.array(latency), received, missed)
 
     def __enter__(self) -> Self:
         with sigint_blocked():

@@ -35,7 +35,7 @@ def test_fast_subscribers_record_each_receipt_and_count_gaps(until, tmp_path):
             send(number, is_lost=number == 2)
         publisher.send(End(len(observations.tracks), ""))
         end = monotonic() + 100.0
-        receipts = subscribers.receipts([observations], [schedule], [5], end)
+        receipts = subscribers.receipts(observations, schedule, 5, end)
         received = monotonic()
     assert receipts.missed == [1, 1]
     assert min(receipts.received) >= 3
