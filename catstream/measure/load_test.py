@@ -118,12 +118,10 @@ def _started(
         observations.append(stack.enter_context(observed(stream.address, next(iter(video.boxes | video.models)))))
         wait_until(partial(has_begun, observations[-1]), f"learning the first models of stream {of_all}")
     groups = [
-        Subscribers(plan, stream.number, channel, stream.address)
-        for stream in (streams if plan.subscribers else ())
+        stack.enter_context(Subscribers(plan, stream.number, channel, stream.address))
+        for stream in streams
         for channel in plan.channels
     ]
-    for group in groups:
-        stack.enter_context(group)
     wait_until(lambda: all(group.connected for group in groups), "attaching subscribers")
     return observations, groups
 
