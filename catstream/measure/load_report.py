@@ -14,6 +14,7 @@ from catstream.base.tables import write_table
 from catstream.measure.latency import PERCENTILES, percentiles
 from catstream.measure.load_result import KINDS, SEARCHES, SHARES, Result, violations
 from catstream.measure.load_test import LoadTest
+from catstream.measure.timeline import timeline
 from catstream.output.report import COLOURS, round_up, write_page
 
 
@@ -89,9 +90,9 @@ class Panel(NamedTuple):
     curves: dict[str, str]
 
 
-def panels(timeline: dict[str, list[float]], due: float) -> Iterator[Panel]:
+def panels(over_time: dict[str, list[float]], due: float) -> Iterator[Panel]:
     """Yield the parts of the chart, which share the axis of time; `due` is the number of frames per second."""
-    figures = {name: np.array(values) for name, values in timeline.items()}
+    figures = {name: np.array(values) for name, values in over_time.items()}
     x = 1000 * (np.arange(len(figures["seconds"])) + 0.5) / len(figures["seconds"])  # the middle of each interval
     latencies = {
         name.replace("-", " at subscribers, "): 1000 * values
@@ -189,7 +190,7 @@ def to_json(load_test: LoadTest, provenance: dict[str, object]) -> dict[str, obj
         "processes": {
             name: {"cores": cores, "memory": result.memory.get(name)} for name, cores in result.cores.items()
         },
-        "timeline": result.timeline,
+        "timeline": timeline(result),
         "subscribers": [
             {
                 **{name: getattr(receipts, name) for name in ("stream", "channel", "received", "missed")},
@@ -224,8 +225,8 @@ def _figures(result: Result) -> dict[str, float]:
 
 def write_report(path: Path, load_test: LoadTest, provenance: dict[str, object]) -> Path:
     """Write the report of the decisive run, and of the steps of a search."""
-    result, timeline = load_test.result, load_test.result.timeline
-    has_chart = len(timeline["seconds"]) > 1
+    result, over_time = load_test.result, timeline(load_test.result)
+    has_chart = len(over_time["seconds"]) > 1
     verdicts = [(verdict(load_test), load_test.sustained is not False)]
     verdicts += [(error, False) for error in result.errors]
     verdicts += [(limit.describe(result), limit.is_met(result)) for limit in load_test.limits]
@@ -240,8 +241,8 @@ def write_report(path: Path, load_test: LoadTest, provenance: dict[str, object])
             f"{milliseconds(result.camera_late)} ms late, and other processes of this machine kept "
             f"{result.other_load:.2f} cores busy."
         ),
-        panels=[*panels(timeline, result.plan.rate * len(result.streams))] if has_chart else [],
-        seconds=sum(timeline["seconds"][-1:] + timeline["seconds"][1:2]),  # the end of the last interval
+        panels=[*panels(over_time, result.plan.rate * len(result.streams))] if has_chart else [],
+        seconds=sum(over_time["seconds"][-1:] + over_time["seconds"][1:2]),  # the end of the last interval
         colours=COLOURS,
         tables=[*([_steps(load_test)] if load_test.find else []), *tables(result)],
         settings=result.plan.settings,

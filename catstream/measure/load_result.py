@@ -16,7 +16,6 @@ from catstream.base.settings import Settings
 from catstream.base.text import counted
 from catstream.errors import SettingsError
 from catstream.measure.latency import PERCENTILES, REST, Measures, Reading, Receipts
-from catstream.measure.timeline import timeline
 from catstream.video import rendered
 
 #: The figures that can have a limit, by name. If there are several streams, the worst one counts.
@@ -142,11 +141,6 @@ class Result:
             for name, value in figures.items():
                 worst[name] = (min if name == "success" else max)(worst[name], value)
         return worst
-
-    @property
-    def timeline(self) -> dict[str, list[float]]:
-        """The figures over time, see `catstream.measure.timeline`."""
-        return timeline(self.plan.rate, self.streams, self.subscribers, self.readings)
 
     @property
     def track(self) -> Float64:

@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 
-from catstream.measure.latency import REST, Measures, Reading, Receipts, percentiles
+from catstream.measure.latency import REST, percentiles
+from catstream.measure.load_result import Result
 
 _MOST_INTERVALS = 3600
 _ROUNDING = 1e-6  # seconds by which a frame may be due before the interval that it belongs to
 
 
-def timeline(
-    rate: float, streams: Sequence[Measures], subscribers: Sequence[Receipts], readings: Sequence[Reading]
-) -> dict[str, list[float]]:
+def timeline(result: Result) -> dict[str, list[float]]:
     """Return the figures of each second, of all streams together.
 
     The intervals are longer in a run of more than an hour, or below one frame per second, so that each has a frame.
@@ -30,6 +29,7 @@ def timeline(
     other_cores        ... by other processes of the machine
     memory             bytes of the pipelines (PSS), which is read every five seconds
     """
+    rate, streams, readings = result.plan.rate, result.streams, result.readings
     start = min(stream.due[0] for stream in streams)
     duration = max(stream.due[-1] for stream in streams) - start
     interval = max(int(duration) // _MOST_INTERVALS + 1, math.ceil(1 / rate))
@@ -43,7 +43,7 @@ def timeline(
 
     # Step 1: latencies, at the load test and at its subscribers; and frames.
     latencies = {"": [(stream.due, stream.track) for stream in streams]}
-    for each in subscribers:
+    for each in result.subscribers:
         latencies.setdefault(f"{each.channel}-", []).append((streams[each.stream].due, each.latency))
     figures: dict[str, list[float]] = {"seconds": seconds.tolist()}
     for prefix, measured in latencies.items():
