@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 from accuracy import accuracy_command, in_processes, videos
+from sequences import frame_size
 from table import Table, benchmark
 
 from catstream.base.arrays import Bool, Float64
@@ -118,7 +119,7 @@ def boxes_until_complete(rows: list[KeyframeRow]) -> dict[str, int | None]:
 
 
 def _rows(sequence: Sequence, most: int, settings: Settings) -> Generator[KeyframeRow]:
-    truth, size = sequence.boxes, sequence.size()
+    truth, size = sequence.boxes, frame_size(sequence)
     usable = [frame for frame in range(len(truth)) if _is_usable(truth[frame], size)]
     first = next((frame for frame in usable if box_of(truth[frame]) is not None), None)
     if first is None:

@@ -6,7 +6,7 @@ import argparse
 import atexit
 import json
 import tempfile
-from contextlib import suppress
+from contextlib import closing, suppress
 from functools import cache
 from pathlib import Path
 
@@ -65,6 +65,13 @@ def sequences(options: argparse.Namespace, prefix: str = "") -> list[Sequence]:
     if not found:
         raise VideoError(f"there is no sequence {prefix}* in {options.data}: pass another --data")
     return found
+
+
+def frame_size(sequence: Sequence) -> tuple[int, int]:
+    """Read the first frame, and return its width and height."""
+    with closing(sequence.frames()) as frames:
+        height, width = next(frames).shape[:2]
+    return width, height
 
 
 def named(options: argparse.Namespace, name: str) -> Sequence:

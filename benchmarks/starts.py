@@ -12,6 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from sequences import frame_size
 
 from catstream.base.box import Box
 from catstream.errors import BoxError, VideoError
@@ -62,7 +63,7 @@ class Start:
         box = Box(*map(float, sequence.boxes[self.frame]))
         if not self.variation.name:
             return box
-        changed, (width, height) = self.variation.applied(box), sequence.since(self.frame).size()
+        changed, (width, height) = self.variation.applied(box), frame_size(sequence.since(self.frame))
         w, h = min(max(changed.w, 2.0), 2.0 * width), min(max(changed.h, 2.0), 2.0 * height)
         return Box(0.0, 0.0, w, h).centred(*changed.centre).with_centre_in(width, height)
 
@@ -134,7 +135,7 @@ def _valid(sequence: Sequence) -> list[int]:
     """
     present = [int(frame) for frame in np.flatnonzero(sequence.present)][:-1]
     try:
-        size = sequence.since(present[0]).size()
+        size = frame_size(sequence.since(present[0]))
     except VideoError:
         return present
     return [frame for frame in present if _is_valid(Box(*map(float, sequence.boxes[frame])), *size)] or present

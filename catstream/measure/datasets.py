@@ -20,7 +20,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Collection, Generator
-from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -88,12 +87,6 @@ class Sequence:
             f"{str(self.path)!r} has fewer frames than boxes ({len(self.boxes) - missing} of {len(self.boxes)}): "
             "each line of the ground truth needs a frame"
         )
-
-    def size(self) -> tuple[int, int]:
-        """Read the first frame, and return its width and height."""
-        with closing(self.frames()) as frames:
-            height, width = next(frames).shape[:2]
-        return width, height
 
 
 def find_sequences(*paths: str | Path, failed: Callable[[VideoError], None] | None = None) -> list[Sequence]:
