@@ -111,9 +111,8 @@ class Site:
 
     async def _control(self, request: Request) -> Response:
         command = await json_of(request, Command)
-        box = Box(*command.box) if command.box is not None else None
         try:
-            answer = await run_in_threadpool(self.feed.execute, **asdict(command) | {"box": box})
+            answer = await run_in_threadpool(self.feed.execute, **asdict(command))
         except asyncio.CancelledError:  # by the server, which waits for its shutdown no longer
             raise HTTPException(503, "the server of this page has ended\n") from None
         result = {"reason": answer.reason, "frame": answer.frame, "version": answer.version, "object": answer.object}
@@ -177,7 +176,7 @@ class Command:
 
     verb: Literal["set-box", "forget", "pause", "resume", "stop"]
     object: str = ""
-    box: tuple[float, float, float, float] | None = None
+    box: Box | None = None
     keep: bool = False
     seconds: float | None = None
     time: float | None = None
