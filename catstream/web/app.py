@@ -20,7 +20,7 @@ from contextlib import asynccontextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from time import monotonic
-from typing import Literal, TypeVar
+from typing import Any, Literal, TypeVar
 
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
@@ -120,19 +120,19 @@ class Site:
 
     async def _updates(self) -> AsyncIterator[str]:
         """Yield the parts of a page that have changed, as server-sent events."""
-        revisions: dict[str, int] = {}
+        sent: dict[str, Any] = {}
         last_sent = monotonic()
         with self.feed.viewed():
             yield f"retry: {1000 * RETRY_SECONDS:.0f}\n\n"
             while not self._closed:
-                if parts := self.feed.dashboard.updates(revisions):
+                if parts := self.feed.dashboard.updates(sent):
                     last_sent = monotonic()
                     yield event(parts)
                 elif monotonic() - last_sent > COMMENT_SECONDS:
                     last_sent = monotonic()
                     yield ":\n\n"
                 await asyncio.sleep(UPDATE_SECONDS)
-            yield event({**self.feed.dashboard.updates(revisions), "closed": True})
+            yield event({**self.feed.dashboard.updates(sent), "closed": True})
 
     async def _annotated_pictures(self) -> AsyncIterator[bytes]:
         last, dashboard = None, self.feed.dashboard

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections import Counter, deque
+from collections import deque
 from dataclasses import dataclass
 from itertools import takewhile
-from typing import Literal, TypeVar
+from typing import Any, Literal, TypeVar
 
 from catstream.video.drawing import Colours
 from catstream.wire.heads import TREES
@@ -54,24 +54,13 @@ class TrackedObject:
 
 
 class Dashboard:
-    """Receives messages, and returns the updates for each open page.
+    """Receives messages, and returns the parts of the page that have changed.
 
     It shows one pipeline. It keeps the last picture and figures until the first message of another pipeline arrives;
     then it drops all state of the previous one.
     """
 
     def __init__(self) -> None:
-        #: Functions that return JSON values, sent to each open page, in this order, if they changed. The argument of
-        #: each is the number of its changes since the page has received it.
-        self._parts = {
-            "pipeline": lambda _: self._revisions["pipeline"],  # the number of pipelines so far; clears a page
-            "status": self._status_part,
-            "tracks": self._tracks_part,
-            "picture": self._picture_part,
-            "points": lambda new: list(self._points)[-new:],
-            "trees": self._trees_part,
-        }
-        self._revisions: Counter[str] = Counter(self._parts.keys())
         self.endpoint = self._attached = ""
         self._run = ""  # id of the run that is shown
         self._runs_before: set[str] = set()  # ids of those before it, whose last messages may still arrive
@@ -88,17 +77,32 @@ class Dashboard:
         self.last_reports: dict[str, float] = {}  #: times of their arrivals
         self._pictures: dict[float, Preview] = {}  # by time: skipped frames of a live source have the same number
         self._points: deque[_Point] = deque(maxlen=_POINTS)
-        self._last_point = float("-inf")  # time of the last chart point
         self._arrivals: dict[int, float] = {}  # of the first track of each frame
         self._tracks: dict[int, dict[str, Track]] = {}  # by frame and object
         self._frame: tuple[int, float] | None = None  # number and time of the newest frame
         self._seq = 0  # of the newest track
 
-    def updates(self, revisions: dict[str, int]) -> dict[str, object]:
-        """Return the parts that have changed since the last call with these revisions; they are empty at first."""
-        news = {name: self._revisions[name] - revisions.get(name, 0) for name in self._parts}
-        revisions.update(self._revisions)
-        return {name: part(news[name]) for name, part in self._parts.items() if news[name]}
+    def updates(self, sent: dict[str, Any]) -> dict[str, Any]:
+        """Return the parts that differ from those that a page was `sent`, a dictionary that is empty at first.
+
+        If another pipeline is shown, these are all parts, with `pipeline` as the first one. Of the points, they are
+        those after the last one that was sent.
+        """
+        parts = {
+            "pipeline": len(self._runs_before),
+            "status": self._status_part(),
+            "tracks": self._tracks_part(),
+            "picture": self._picture_part(),
+            "trees": self._trees_part(),
+        }
+        if sent.get("pipeline") != parts["pipeline"]:
+            sent.clear()
+        last = sent["points"][-1][0] if "points" in sent else float("-inf")
+        changed = {name: part for name, part in parts.items() if name not in sent or sent[name] != part}
+        if points := [point for point in self._points if point[0] > last]:
+            changed["points"] = points
+        sent.update(changed)
+        return changed
 
     def mark_silent(self, reason: str) -> None:
         """Record that nothing arrives."""
@@ -106,17 +110,12 @@ class Dashboard:
             self.phase = "silent"
         if self.phase != "ended":
             self.reason = reason
-        self._mark_changed("status")
-
-    def _mark_changed(self, *parts: str) -> None:
-        self._revisions.update(parts)
 
     def attach(self, endpoint: str) -> None:
         """Expect messages from this endpoint from now on; the state is kept until the first one arrives."""
         self._attached = endpoint
         if self.phase == "waiting":
             self.endpoint = endpoint
-            self._mark_changed("status")
 
     def take(self, message: object, now: float, run: str = "") -> None:
         """Process a message that arrived at the time `now`, in seconds of a monotonic clock.
@@ -129,11 +128,9 @@ class Dashboard:
             if self._run:
                 self._runs_before.add(self._run)
                 self._reset()
-                self._mark_changed(*self._parts)
             self._run, self.endpoint = run, self._attached
         if self.phase in ("waiting", "silent") and not isinstance(message, End):
             self.phase, self.reason = "running", ""
-            self._mark_changed("status")
         match message:
             case Track():
                 self._add_track(message, now)
@@ -143,10 +140,8 @@ class Dashboard:
                 self._add_health(message, now)
             case Preview():
                 _remember(self._pictures, message.time, message, _PICTURES)
-                self._mark_changed("picture")
             case End() if self.phase != "ended":
                 self.phase, self.reason = "ended", message.reason
-                self._mark_changed("status")
 
     @property
     def state(self) -> tuple[str, str]:
@@ -186,8 +181,6 @@ class Dashboard:
         return preview, [track for track in tracks if track.object in self.objects]
 
     def _add_track(self, track: Track, now: float) -> None:
-        if self._holds:
-            self._mark_changed("status")
         self._seq = track.seq
         name, before = track.object, self.objects.get(track.object)
         if before is None or before.began not in (None, track.began):  # another object of this name begins
@@ -201,7 +194,6 @@ class Dashboard:
             _remember(self._arrivals, track.frame, now, _FRAMES)
         self._tracks[track.frame][name] = track
         self._add_point(now)
-        self._mark_changed("tracks")
 
     def _add_model(self, model: Model, now: float) -> None:
         """Measure the latency of a new model of a shown object; not of another object that had the name before."""
@@ -218,9 +210,7 @@ class Dashboard:
         self.source = health.source or self.source
         if health.process == "detector":
             self._add_objects(health)
-            self._mark_changed("tracks")
         self._add_point(now)
-        self._mark_changed("status", "trees")
 
     def _add_objects(self, health: Health) -> None:
         """Add the objects of the detector's report that have no track yet; drop those that it does not track."""
@@ -238,17 +228,15 @@ class Dashboard:
         self.colours.keep(self.objects)
 
     def _add_point(self, now: float) -> None:
-        if not self.objects or now - self._last_point < POINT_SECONDS:
+        if not self.objects or (self._points and now - self._points[-1][0] < POINT_SECONDS):
             return
-        self._last_point = now
         objects = {
             name: (round(tracked.score, 3), tracked.model_latency, tracked.version, tracked.state != "absent")
             for name, tracked in ({} if self._holds else self.objects).items()
         }
         self._points.append((round(now, 3), self.rate(now), objects))
-        self._mark_changed("points")
 
-    def _status_part(self, _: int) -> dict[str, object]:
+    def _status_part(self) -> dict[str, object]:
         counters = self.health["detector"].counters if "detector" in self.health else {}
         state, words = self.state
         return {name: getattr(self, name) for name in ("phase", "reason", "endpoint", "source")} | {
@@ -258,7 +246,7 @@ class Dashboard:
             "skipped": counters.get("skipped"),
         }
 
-    def _tracks_part(self, _: int) -> dict[str, object]:
+    def _tracks_part(self) -> dict[str, object]:
         frame, time = self._frame or (None, None)
         objects = [
             {"name": name, "colour": tracked.colour, "version": tracked.version}
@@ -267,11 +255,11 @@ class Dashboard:
         ]
         return {"frame": frame, "time": time, "objects": objects}
 
-    def _picture_part(self, _: int) -> dict[str, object] | None:
+    def _picture_part(self) -> dict[str, object] | None:
         preview = next(reversed(self._pictures.values()), None)
         return preview if preview is None else {name: getattr(preview, name) for name in _SHOWN_OF_A_PICTURE}
 
-    def _trees_part(self, _: int) -> dict[str, object]:
+    def _trees_part(self) -> dict[str, object]:
         counted = self.health["compressor"].objects if "compressor" in self.health else {}
         kinds = [{"title": tree.title, "meaning": tree.meaning} for tree in TREES.values()]
         objects = {
