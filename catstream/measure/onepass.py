@@ -74,14 +74,13 @@ def evaluate(
     *,
     jobs: int = 1,
     done: Callable[[Run], None] = lambda _: None,
-    failed: Callable[[CatstreamError], None] | None = None,
+    failed: Callable[[CatstreamError], None],
 ) -> list[Run]:
     """Run `catstream.Tracker` on sequences, and return the runs in their order.
 
     jobs : number of processes, with one thread each
     done : function that is called with each finished run
-    failed : function that is called with the error of each run that fails, while the other runs continue; if None, the
-        error is raised
+    failed : function that is called with the error of each run that fails, while the other runs continue
     """
     names = [sequence.name for sequence in sequences]
     for name in names:
@@ -95,8 +94,6 @@ def evaluate(
             if isinstance(result, Run):
                 runs[result.sequence.name] = result
                 done(result)
-            elif failed is None:
-                raise result
             else:
                 failed(result)
     return [runs[name] for name in names if name in runs]
