@@ -74,13 +74,14 @@ def evaluate(
     *,
     jobs: int = 1,
     done: Callable[[Run], None] = lambda _: None,
-    failed: Callable[[CatstreamError], None],
+    failed: Callable[[CatstreamError], None] | None = None,
 ) -> list[Run]:
     """Run `catstream.Tracker` on sequences, and return the runs in their order.
 
     jobs : number of processes, with one thread each
     done : function that is called with each finished run
-    failed : function that is called with the error of each run that fails, while the other runs continue
+    failed : function that is called with the error of each run that fails, while the other runs continue; if None, the
+        error is raised
     """
     names = [sequence.name for sequence in sequences]
     for name in names:
@@ -94,6 +95,8 @@ def evaluate(
             if isinstance(result, Run):
                 runs[result.sequence.name] = result
                 done(result)
+            elif failed is None:
+                raise result
             else:
                 failed(result)
     return [runs[name] for name in names if name in runs]

@@ -29,7 +29,7 @@ def longer(sequence) -> Sequence:
 def test_processes_give_the_same_runs_as_one_and_name_a_sequence_that_fails(sequence, longer):
     late = Sequence("late", sequence.path, np.vstack([[[np.nan] * 4] * 2, sequence.boxes[2:]]))
     errors: list[CatstreamError] = []
-    alone = evaluate([sequence, late], SETTINGS, failed=errors.append)
+    alone = evaluate([sequence, late], SETTINGS)
     pooled = evaluate([longer, sequence, late], SETTINGS, jobs=2, failed=errors.append)
     (error,) = errors
     assert re.match(r"longer: .* fewer frames than boxes", str(error))
@@ -41,11 +41,13 @@ def test_processes_give_the_same_runs_as_one_and_name_a_sequence_that_fails(sequ
     np.testing.assert_allclose(part.boxes[0], sequence.boxes[2], atol=1e-3)
     assert whole.score().auc > 0.3
     assert (whole.seconds > 0).all()
+    with pytest.raises(CatstreamError, match="longer: "):
+        evaluate([longer], SETTINGS)
 
 
 def test_equal_names_are_an_error(sequence):
     with pytest.raises(CatstreamError, match="duplicate sequence name 'walk'"):
-        evaluate([sequence, sequence], SETTINGS, failed=pytest.fail)
+        evaluate([sequence, sequence], SETTINGS)
 
 
 def test_a_mean_averages_measures_and_adds_up_frames(sequence, found):
