@@ -242,7 +242,7 @@ def until():
 
 @pytest.fixture(scope="session")
 def alive():
-    """Whether a process runs; one that ended and was not asked for its exit code yet does not."""
+    """A function that returns whether a process runs; a zombie does not."""
 
     def runs(pid):
         try:

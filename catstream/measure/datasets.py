@@ -98,14 +98,14 @@ def find_sequences(*paths: str | Path, failed: Callable[[VideoError], None] | No
     truths: dict[Path, _Truth] = {}  # by the file
     for path in map(Path, paths):
         folders = sorted(path.glob("[!.]*/"), key=natural_order)
-        found = _truths(path) or [truth for folder in folders for truth in _truths(folder)]
-        if not found:
+        annotated = _truths(path) or [truth for folder in folders for truth in _truths(folder)]
+        if not annotated:
             raise VideoError(
                 f"there is no annotated sequence in {str(path)!r}: expected a folder of frames with "
                 "groundtruth_rect.txt (x,y,w,h), gt.txt (TLD), groundtruth.txt (VOT, LaSOT, GOT-10k) or FOLDER.txt "
                 "(Princeton), or a folder of such folders"
             )
-        for truth in found:
+        for truth in annotated:
             truths.setdefault(truth.file.resolve(), truth)
     sequences = []
     for truth in truths.values():

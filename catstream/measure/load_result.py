@@ -30,7 +30,7 @@ KINDS = {
 #: Those that are shares; the others are times.
 SHARES = ("skipped", "subscriber-missed", "success")
 
-#: The parameters whose highest number can be searched for, by name, and the highest one that is tried.
+#: The parameters that a search can maximise, by name, with the upper bound of the search.
 SEARCHES = {"streams": 64, "rate": 1000, "subscribers": 1000}
 
 #: Is called about ten times a second with the current activity, the share of it that is done, and current figures.

@@ -31,8 +31,8 @@ _SHARES = np.linspace(0, 0.5, 51)
 class Score:
     """The measures of one run, from 0 to 1, and numbers of frames.
 
-    absent, noticed  frames without the object, and those of them without a reported box
-    present, false   frames with the object, and those of them without a reported box
+    absent, noticed  frames without the object, and how many of them have no reported box
+    present, false   frames with the object, and how many of them have no reported box
     """
 
     auc: float
@@ -90,16 +90,16 @@ def score(boxes: Float64, truth: Float64) -> Score:
 
     boxes, truth : float64 (frames, 4), x, y, w, h in pixels, NaN if there is no box
     """
-    shown, reported = present(truth), present(boxes)
+    is_present, is_reported = present(truth), present(boxes)
     success = success_plot(boxes, truth)
-    off = distances(boxes, truth, normalised=True)[shown]
+    off = distances(boxes, truth, normalised=True)[is_present]
     return Score(
         auc=float(success.mean()),
         success=float(success[10]),
         precision=float(precision_plot(boxes, truth)[20]),
         normalised_precision=float((off[:, None] <= _SHARES).mean()),
-        absent=int((~shown).sum()),
-        noticed=int((~shown & ~reported).sum()),
-        present=int(shown.sum()),
-        false=int((shown & ~reported).sum()),
+        absent=int((~is_present).sum()),
+        noticed=int((~is_present & ~is_reported).sum()),
+        present=int(is_present.sum()),
+        false=int((is_present & ~is_reported).sum()),
     )

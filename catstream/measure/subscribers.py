@@ -69,8 +69,8 @@ class Subscribers:
                 raise ServiceError("a process of the subscribers has exited: its error is printed above")
             for receipts, gaps in pipe.recv():
                 # A restarted detector reuses numbers: what arrived before its frame was due is about another frame.
-                found = [(moment, numbers.get(frame, -1)) for frame, moment in zip(*receipts, strict=True)]
-                answers = [(moment, number) for moment, number in found if moment >= schedule.due(number)]
+                arrivals = [(moment, numbers.get(frame, -1)) for frame, moment in zip(*receipts, strict=True)]
+                answers = [(moment, number) for moment, number in arrivals if moment >= schedule.due(number)]
                 latency.append(latencies_to_answer(times, answers, end).astype(np.float32))
                 received.append(len(receipts[0]))
                 missed.append(gaps)

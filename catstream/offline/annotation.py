@@ -288,7 +288,7 @@ class Annotation:
                 self._insert(task, Pass(task.start, task.stop, *rows, task.use_memory))
 
     def _origin(self) -> list[object]:
-        """What the passes follow from, apart from the boxes."""
+        """The inputs of the passes except the boxes; stored passes are used only if they are equal."""
         stats = [file.stat() for file in self.frames.images or [self._video] if file.exists()]  # it may be a pattern
         files = [[stat.st_size, stat.st_mtime_ns] for stat in stats]
         return [version("catstream"), self.settings.changed(), repr(self._part), len(self.frames), files]

@@ -1,1 +1,1 @@
-"""Where tracks go, during a run or from its log, and the report of them. `destinations` has the table of them."""
+"""Writes tracks to files and services, during a run or from its log; `destinations` has the table of formats."""

@@ -17,7 +17,7 @@ Mode = Literal["rtp", "parsed", "jpegs"]
 #: The server closed the connection; nothing or no frame arrived in time; FFmpeg cannot read the data; any other error.
 Kind = Literal["ended", "silent", "invalid", "failed"]
 
-#: What happens to the mode after a loss, by the kind of the loss and by whether the mode has delivered a frame.
+#: The next mode after a loss, by the kind of the loss and by whether the mode has delivered a frame.
 TABLE: dict[tuple[Kind, bool], Literal["keep", "first", "other"]] = {
     ("ended", True): "keep",
     ("ended", False): "first",

@@ -45,7 +45,7 @@ def test_interrupted_run_returns_its_measurements_and_leaves_no_process():
 
 
 def test_still_before_the_first_frame_is_not_taken_for_it_at_a_low_rate():
-    settings = Settings(run={"endpoint": "run"})  # of the only pipeline of a shell; those of a load test have their own
+    settings = Settings(run={"endpoint": "run"})  # is ignored: each stream of a load test has its own endpoint
     load_test = run_load_test(Plan(rate=1.0, duration=1.0, size=(64, 64), settings=settings), [])
     (stream,) = load_test.result.streams
     assert stream.track[0] > 0

@@ -1,4 +1,4 @@
-"""The figures over time: each second has those of the frames that are due in it, and the readings at its end."""
+"""The figures over time: a second has the latencies of the frames due in it, and the readings at its end."""
 
 import numpy as np
 import pytest
