@@ -20,6 +20,8 @@ OPTIONS = {"fflags": "noparse", "probesize": "32", "analyzeduration": "1"}
 _START = b"\0\0\0\1"  # of a unit, which FFmpeg writes before its header
 _TYPE = 0x1F  # of the byte after it
 _KEY_TYPES = {5, 7, 8}  # a slice of a keyframe, and the parameters of a sequence and of a picture
+_SLICE_TYPES = {1, 5}
+_FIRST = 0x80  # bit of the byte after it, set in the first slice of a frame
 
 
 class NalUnits:
@@ -32,7 +34,11 @@ class NalUnits:
         self._pts: int | None = None
 
     def take(self, packet: Packet[Any]) -> Iterator[Packet[Any]]:
-        """Yield the units that are whole after this packet. ValueError if a unit was split in another way."""
+        """Yield the units that are whole after this packet.
+
+        ValueError if a unit was split in another way, or a frame has several slices: the decoder would conceal the
+        missing ones after each of them.
+        """
         data = bytes(packet)
         if data.startswith(_START) or not data:
             yield from self._whole(packet)
@@ -53,6 +59,9 @@ class NalUnits:
         if self._unit:
             unit: Packet[Any] = av.Packet(self._unit)
             unit.pts, unit.time_base = self._pts, packet.time_base
-            unit.is_keyframe = self._unit[len(_START)] & _TYPE in _KEY_TYPES
+            header, *content = self._unit[len(_START) : len(_START) + 2]
+            if header & _TYPE in _SLICE_TYPES and content and content[0] < _FIRST:
+                raise ValueError("a frame has several slices")
+            unit.is_keyframe = header & _TYPE in _KEY_TYPES
             self._unit = b""
             yield unit

@@ -20,7 +20,7 @@ LONGEST = 100  # bytes of a fragment
 
 
 def unit(size, kind=1):
-    return START + bytes([kind]) + b"\x55" * size
+    return START + bytes([kind]) + b"\xaa" * size  # the first slice of a frame
 
 
 def fragments(whole):
@@ -54,7 +54,14 @@ def test_a_unit_that_continues_after_a_shorter_fragment_is_an_error():
     units = NalUnits()
     taken(units, *fragments(unit(250)))
     with pytest.raises(ValueError, match="shorter"):
-        taken(units, b"\x55" * 10)
+        taken(units, b"\xaa" * 10)
+
+
+def test_second_slice_of_a_frame_is_an_error():
+    units = NalUnits()
+    taken(units, unit(40), *fragments(unit(150)))
+    with pytest.raises(ValueError, match="several slices"):
+        taken(units, START + b"\1" + b"\x55" * 40, unit(40))
 
 
 def test_a_unit_has_the_time_of_its_first_fragment_and_says_whether_it_is_key():
