@@ -51,9 +51,10 @@ def compare(before: dict[str, Any], after: dict[str, Any], tolerance: float) -> 
         {**each["plan"], **{key: each[key] for key in ("settings", "interrupted", "find")}} for each in (before, after)
     ]
     differ = [key for key in sorted(plans[0].keys() | plans[1].keys()) if plans[0].get(key) != plans[1].get(key)]
-    if lines := [f"{key} ({plans[0].get(key)}, {plans[1].get(key)})" for key in differ if key != find]:
+    if names := [key for key in differ if key != find]:
         raise SettingsError(
-            f"the results have different plans: {', '.join(lines)}; repeat one load test like the other"
+            f"the results have different plans ({', '.join(names)}): {before['command']!r} and {after['command']!r}; "
+            "repeat one load test like the other"
         )
     changes = []
     for name in [f"highest {find}"] if find else before["figures"]:
