@@ -23,9 +23,9 @@ import atheris
 import numpy as np
 from table import Table, benchmark, command
 
-COMPILED = ["catstream.features.kernels"]  # by numba: no bytecode
+KERNELS = ["features.kernels", "features.sampling", "detection.sparse_coding"]  # compiled by numba: no bytecode
 
-with atheris.instrument_imports(include=["catstream"], exclude=COMPILED):
+with atheris.instrument_imports(include=["catstream"], exclude=[f"catstream.{name}" for name in KERNELS]):
     from catstream.base.box import Box
     from catstream.base.settings import Settings
     from catstream.client.saved_model import SavedModel

@@ -21,7 +21,7 @@ IMPORTERS = {
     "scipy": "base/threads.py base/ridge.py coreset/reduce.py",
     "cv2": "base/threads.py detection features processes/detector.py output/events.py video",
     "filterpy": "training/motion_em.py",
-    "numba": "features/kernels.py",
+    "numba": "features/compilation.py",
     "sklearn": "detection/scm.py sketch.py training/one_class.py video/rendered.py",
     "safetensors": "wire/storage.py",
     "obstore": "fleet/store.py",

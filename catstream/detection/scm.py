@@ -25,7 +25,7 @@ from sklearn.linear_model import Lasso
 
 from catstream.base.box import Box
 from catstream.base.threads import FILTERS
-from catstream.features.kernels import sparse_codes
+from catstream.detection.sparse_coding import sparse_codes
 from catstream.features.pyramid import Pyramid
 
 _SIDE = 32  # of a template, in pixels

@@ -1,83 +1,23 @@
-"""Kernels: loops over pixels and cells, compiled by numba when this module is imported, and cached from then on.
+"""Kernels of cells: HOG, colours and feature rows of an image, and the scores of its windows.
 
-numba's cache is invalidated by changes of this file only. So all kernels are here, with the functions that they call
-and the constants that they read; `catstream.features.layout` repeats some of these constants, and a test compares them.
-
-A kernel writes into an output array of its caller. Arithmetic may be reordered, except in `average`, and neither bounds
-nor divisions by 0 are checked. A call releases the GIL. An array of another type than in the signature, or a read-only
-one, is a TypeError.
+They are one file, since they call one another (see `catstream.features.compilation`). For the same reason, constants of
+`catstream.features.layout` are repeated here; a test compares them.
 """
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Callable
-from functools import cache
-from typing import Any, TypeVar, cast
+from typing import Any
 
 import numpy as np
 from numpy import float32
 
-from catstream.base.arrays import Float32, Float64, Int64, UInt8, UInt16, UInt32
-from catstream.errors import ServiceError
+from catstream.base.arrays import Float32, Int64, UInt8, UInt16
+from catstream.features.compilation import function, kernel
 
-try:
-    import numba
-    from numba.core import event
-except PermissionError:
-    raise ServiceError(
-        "kernels cannot be compiled, as this process may not make memory executable: allow it, in a unit of systemd "
-        "with MemoryDenyWriteExecute=no"
-    ) from None
-
-#: Logged at the first start after an installation, before the kernels are compiled.
-COMPILING = "compiling kernels, once: about 8 s"
+_OPTIONS: dict[str, Any] = {"nogil": True, "fastmath": True, "error_model": "numpy"}
 
 CELL, WINDOW, CHANNELS, SIDE = 8, 8, 34, 4  # as in layout.py
 _PLACES = WINDOW * WINDOW * CHANNELS  # features of the cells of a window, before those of its colours
-
-_Function = TypeVar("_Function", bound=Callable[..., Any])
-
-_log = logging.getLogger(__name__)
-_options: dict[str, Any] = {"nogil": True, "fastmath": True, "error_model": "numpy"}
-_part: Callable[[_Function], _Function] = numba.njit(**_options)  # a function that kernels call
-_ordered: Callable[[_Function], _Function] = numba.njit(**_options | {"fastmath": False})
-
-
-def _kernel(signature: str, **changes: bool) -> Callable[[_Function], _Function]:
-    """Compile a function for these types, or load its machine code from the cache.
-
-    The cache is the folder NUMBA_CACHE_DIR, or else `__pycache__` beside this file, or else the user's cache folder. If
-    none of them can be written, or a file in it is damaged, every start compiles. `changes` are changed options.
-    """
-    options = _options | changes
-
-    def compiled(function: _Function) -> _Function:
-        with event.install_listener("numba:compile", _Announcement()):
-            try:
-                kernel = numba.njit(signature, cache=True, **options)(function)
-            except Exception:  # of the cache: there is no folder, its disk is full, a file is damaged
-                kernel = numba.njit(signature, **options)(function)
-        return cast(_Function, kernel)
-
-    return compiled
-
-
-class _Announcement(event.Listener):
-    """Logs `COMPILING` before the first kernel that is compiled."""
-
-    def on_start(self, _: event.Event) -> None:
-        _announce()
-
-    def on_end(self, _: event.Event) -> None:
-        pass
-
-
-@cache
-def _announce() -> None:
-    _log.warning(COMPILING)
-
-
 _ORIENTATIONS = 9
 _SIGNED = 2 * _ORIENTATIONS
 _HALF = CELL // 2
@@ -120,7 +60,7 @@ _XYZ_SHARES = np.rint(np.divide(_XYZ, [[0.950456], [1.0], [1.088754]]) * (1 << _
 _ZERO_LIGHT = (16 * 255 * (1 << _ROOT_BITS) + 50) // 100  # 116 roots less the lightness
 
 
-@_part
+@function(**_OPTIONS)
 def _lab(blue: int, green: int, red: int) -> tuple[int, int, int]:
     """Lab of a colour."""
     r, g, b = _LINEAR[red], _LINEAR[green], _LINEAR[blue]
@@ -133,7 +73,7 @@ def _lab(blue: int, green: int, red: int) -> tuple[int, int, int]:
     return light, ((500 * (x - y) + half) >> _ROOT_BITS) + 128, ((200 * (y - z) + half) >> _ROOT_BITS) + 128
 
 
-@_kernel("void(uint8[:,::1], uint8[:,::1])")
+@kernel("void(uint8[:,::1], uint8[:,::1])", **_OPTIONS)
 def convert_to_lab(colours: UInt8, lab: UInt8) -> None:
     """Lab of colours, (k, 3): blue, green, red to lightness, a, b, as OpenCV's `COLOR_BGR2LAB` converts them.
 
@@ -144,7 +84,7 @@ def convert_to_lab(colours: UInt8, lab: UInt8) -> None:
         lab[k, 0], lab[k, 1], lab[k, 2] = _lab(colours[k, 0], colours[k, 1], colours[k, 2])
 
 
-@_part
+@function(**_OPTIONS)
 def _read(planes: UInt8, y: int, line: Float32) -> None:
     """The three channels of one row of pixels, the pixels at the edge twice."""
     width = line.shape[1] - 2
@@ -155,7 +95,7 @@ def _read(planes: UInt8, y: int, line: Float32) -> None:
         values[0], values[width + 1] = values[1], values[width]
 
 
-@_part
+@function(**_OPTIONS)
 def _gradients(
     above: Float32, here: Float32, below: Float32, across: Float32, down: Float32, magnitude: Float32
 ) -> None:
@@ -178,7 +118,7 @@ def _gradients(
         magnitude[x] = np.sqrt(largest)
 
 
-@_part
+@function(**_OPTIONS)
 def _orientations(across: Float32, down: Float32, orientation: UInt8) -> None:
     """Which of 18 directions, 0 ... 17, each gradient points to."""
     for x in range(len(orientation)):
@@ -191,7 +131,7 @@ def _orientations(across: Float32, down: Float32, orientation: UInt8) -> None:
         orientation[x] = np.uint8(float32(0) if o == float32(_SIGNED) else o)
 
 
-@_part
+@function(**_OPTIONS)
 def _add(magnitude: Float32, orientation: UInt8, shares: Float32, blocks: Float32) -> None:
     """Add a line's pixels to the four shares of their orientation in the block of 8 x 8 pixels that they lie in."""
     for i in range(CELL):  # not block by block: to add to what was just added to is slow
@@ -204,7 +144,7 @@ def _add(magnitude: Float32, orientation: UInt8, shares: Float32, blocks: Float3
             four[0], four[1], four[2], four[3] = a, b, c, d
 
 
-@_part
+@function(**_OPTIONS)
 def _count(planes: UInt8, margin: int, shares: Float32, histogram: Float32) -> None:
     """Histograms of the cells within a margin."""
     rows, columns = histogram.shape[0] - 2, histogram.shape[1] - 2
@@ -245,7 +185,7 @@ def _count(planes: UInt8, margin: int, shares: Float32, histogram: Float32) -> N
                 histogram[band + 1, block + 1, o] += blocks[block, o, 3]
 
 
-@_part
+@function(**_OPTIONS)
 def _average(plane: UInt8, row: int, column: int) -> int:
     """The mean of one channel of a cell's pixels."""
     total = float32(CELL * CELL // 2)  # half, to round; floats are added eight at once
@@ -255,7 +195,7 @@ def _average(plane: UInt8, row: int, column: int) -> int:
     return int(total) // (CELL * CELL)
 
 
-@_part
+@function(**_OPTIONS)
 def _colour(planes: UInt8, margin: int, cells: Float32) -> None:
     """The mean colour of each cell, converted to Lab (decision 11)."""
     for row in range(cells.shape[0]):
@@ -268,7 +208,7 @@ def _colour(planes: UInt8, margin: int, cells: Float32) -> None:
             cells[row, column, 33] = float32(b - _LAB_MIDDLE) * _CHROMA_SCALE
 
 
-@_part
+@function(**_OPTIONS)
 def _normalise(histogram: Float32, margin: int, cells: Float32) -> None:
     """Each cell's histogram by the energies of the four blocks of 2 x 2 cells that it is in."""
     rows, columns = histogram.shape[0] - 2, histogram.shape[1] - 2
@@ -314,7 +254,7 @@ def _normalise(histogram: Float32, margin: int, cells: Float32) -> None:
             features[30] = _TEXTURE * texture_d
 
 
-@_kernel("void(uint8[:,:,::1], int64, float32[:,:,::1], float32[:,:,::1])")
+@kernel("void(uint8[:,:,::1], int64, float32[:,:,::1], float32[:,:,::1])", **_OPTIONS)
 def describe_cells(planes: UInt8, margin: int, shares: Float32, cells: Float32) -> None:
     """HOG and mean colour of the cells within the margin.
 
@@ -328,7 +268,7 @@ def describe_cells(planes: UInt8, margin: int, shares: Float32, cells: Float32) 
     _colour(planes, margin, cells)
 
 
-@_kernel("void(uint8[:,:,:], uint16[::1], uint16[:,::1])")
+@kernel("void(uint8[:,:,:], uint16[::1], uint16[:,::1])", **_OPTIONS)
 def look_up_shades(planes: UInt8, table: UInt16, shades: UInt16) -> None:
     """The shade of every 2 x 2 pixels of the planes blue, green and red, by a table of BGR colours of 5 bits each."""
     for y in range(shades.shape[0]):
@@ -342,7 +282,7 @@ def look_up_shades(planes: UInt8, table: UInt16, shades: UInt16) -> None:
             shades[y, x] = table[place]
 
 
-@_part
+@function(**_OPTIONS)
 def _count_shades(shades: UInt16, row: int, column: int, features: Float32) -> None:
     """Features of the window whose first cell is (row, column), into float32 (SHADES,)."""
     for shade in range(len(features)):
@@ -354,7 +294,7 @@ def _count_shades(shades: UInt16, row: int, column: int, features: Float32) -> N
         features[shade] = _ROOT * np.sqrt(features[shade])
 
 
-@_kernel("void(uint16[:,::1], float32[::1], float32, float32[:,::1])")
+@kernel("void(uint16[:,::1], float32[::1], float32, float32[:,::1])", **_OPTIONS)
 def add_colour_scores(shades: UInt16, weights: Float32, threshold: float, scores: Float32) -> None:
     """Add the score of the histogram of each window.
 
@@ -394,7 +334,7 @@ def add_colour_scores(shades: UInt16, weights: Float32, threshold: float, scores
                 counts[shade] -= leaves[shade]
 
 
-@_kernel("void(float32[:,::1], uint16[:,::1], int64[:,::1], float32[:,::1])")
+@kernel("void(float32[:,::1], uint16[:,::1], int64[:,::1], float32[:,::1])", **_OPTIONS)
 def cut_rows(grid: Float32, shades: UInt16, places: Int64, features: Float32) -> None:
     """Feature rows of the windows whose first cells are at `places`."""
     for k in range(len(places)):
@@ -407,7 +347,7 @@ def cut_rows(grid: Float32, shades: UInt16, places: Int64, features: Float32) ->
         _count_shades(shades, row, column, features[k, _PLACES:])
 
 
-@_kernel("void(uint8[:,:,:,::1], int64, float32[:,:,::1], uint16[::1], float32[:,::1])")
+@kernel("void(uint8[:,:,:,::1], int64, float32[:,:,::1], uint16[::1], float32[:,::1])", **_OPTIONS)
 def describe_windows(patches: UInt8, margin: int, shares: Float32, table: UInt16, features: Float32) -> None:
     """Feature rows of patches, each of which is a window and its margin."""
     cells = np.empty((WINDOW, WINDOW, CHANNELS), np.float32)
@@ -419,7 +359,7 @@ def describe_windows(patches: UInt8, margin: int, shares: Float32, table: UInt16
         cut_rows(cells.reshape(WINDOW, -1), shades, first, features[k : k + 1])
 
 
-@_kernel("void(float32[:,::1], float32[:,::1], float32[:,::1])")
+@kernel("void(float32[:,::1], float32[:,::1], float32[:,::1])", **_OPTIONS)
 def add_cell_scores(grid: Float32, weights: Float32, scores: Float32) -> None:
     """Add the products of each row of cells, (34 columns,), with each row of the windows that it lies in."""
     for row in range(len(grid)):
@@ -430,175 +370,3 @@ def add_cell_scores(grid: Float32, weights: Float32, scores: Float32) -> None:
                 for j in range(WINDOW * CHANNELS):
                     total += cells[j] * line[j]
                 scores[row - i, column] += total
-
-
-@_kernel("void(uint8[:,::1], float64, float64, float64, float64, uint8[:,:,::1])")
-def sample(image: UInt8, left: float, top: float, across: float, down: float, output: UInt8) -> None:
-    """Linear interpolation at left, left + across ... and top, top + down ...: between rows first, then in the row."""
-    channels, rows, columns = output.shape
-    height, width = image.shape[0], image.shape[1] // channels
-    begin = min(max(int(np.floor(left)), 0), width - 1)
-    end = min(max(int(np.floor(left + (columns - 1) * across)) + 2, begin + 1), width)
-    line = np.empty(image.shape[1], np.float32)
-    # For every output pixel: the indices in the line of its two neighbours, and the weight of the second one.
-    first, second, share = np.empty(columns, np.uint32), np.empty(columns, np.uint32), np.empty(columns, np.float32)
-    for i in range(columns):
-        x = left + i * across
-        pixel = int(np.floor(x))
-        first[i] = (min(max(pixel, begin), end - 1) - begin) * channels
-        second[i] = (min(max(pixel + 1, begin), end - 1) - begin) * channels
-        share[i] = x - np.floor(x)
-    for row in range(rows):
-        y = top + row * down
-        pixel = int(np.floor(y))
-        above = image[min(max(pixel, 0), height - 1), begin * channels : end * channels]
-        below = image[min(max(pixel + 1, 0), height - 1), begin * channels : end * channels]
-        part = float32(y - np.floor(y))
-        for i in range((end - begin) * channels):
-            value = float32(above[i])
-            line[i] = value + part * (float32(below[i]) - value) + float32(0.5)  # half, to round
-        for channel in range(channels):
-            values, output_line = line[channel:], output[channel, row]
-            for i in range(columns):
-                value = values[first[i]]
-                output_line[i] = np.uint8(value + share[i] * (values[second[i]] - value))
-
-
-@_ordered
-def _taps(scale: float, size: int, pixels: UInt32, shares: Float32) -> None:
-    """The pixels of an axis of `size` pixels that each output pixel covers, `scale` of them; and their shares of it."""
-    for i in range(pixels.shape[1]):
-        begin, count = i * scale, 0
-        end = begin + scale
-        covered = min(scale, size - begin)
-        last = min(int(np.floor(end)), size - 1)
-        first = min(int(np.ceil(begin)), last)
-        if first - begin > 1e-3:
-            pixels[count, i], shares[count, i] = first - 1, (first - begin) / covered
-            count += 1
-        for pixel in range(first, last):
-            pixels[count, i], shares[count, i] = pixel, 1 / covered
-            count += 1
-        if end - last > 1e-3:
-            pixels[count, i], shares[count, i] = last, min(end - last, 1.0, covered) / covered
-
-
-@_kernel("void(uint8[:,:,::1], float64, float64, uint8[:,:,::1])", fastmath=False)
-def average(image: UInt8, across: float, down: float, output: UInt8) -> None:
-    """Reduce an image of three channels: the mean of the `across` x `down` pixels that an output pixel covers.
-
-    The pixels equal `cv2.INTER_AREA`, which takes twice as long.
-    """
-    rows, columns = output.shape[:2]
-    below, right = max(3, int(np.ceil(down)) + 1), max(3, int(np.ceil(across)) + 1)
-    lines, parts = np.zeros((below, rows), np.uint32), np.zeros((below, rows), np.float32)
-    places, shares = np.zeros((right, columns), np.uint32), np.zeros((right, columns), np.float32)
-    _taps(down, image.shape[0], lines, parts)
-    _taps(across, image.shape[1], places, shares)
-    places *= np.uint32(3)
-    line = np.empty(3 * image.shape[1], np.float32)
-    reduced, total = np.empty(3 * columns, np.float32), np.empty(3 * columns, np.float32)
-    ready = -1
-    for row in range(rows):
-        for tap in range(below):
-            part = parts[tap, row]
-            if part == 0:
-                break
-            if lines[tap, row] != ready:  # two output rows may cover the same one
-                ready = lines[tap, row]
-                values = image[ready].reshape(-1)
-                for i in range(len(line)):
-                    line[i] = values[i]
-                for i in range(columns):
-                    blue, green, red = float32(0), float32(0), float32(0)
-                    for k in range(3):  # unrolled: mostly there are no more
-                        place, share = places[k, i], shares[k, i]
-                        blue += line[place] * share
-                        green += line[place + 1] * share
-                        red += line[place + 2] * share
-                    for k in range(3, right):
-                        place, share = places[k, i], shares[k, i]
-                        blue += line[place] * share
-                        green += line[place + 1] * share
-                        red += line[place + 2] * share
-                    reduced[3 * i], reduced[3 * i + 1], reduced[3 * i + 2] = blue, green, red
-            if tap == 0:
-                total[:] = 0
-            for i in range(len(total)):
-                total[i] += part * reduced[i]
-        pixels = output[row].reshape(-1)
-        for i in range(len(total)):
-            pixels[i] = np.uint8(np.rint(total[i]))
-
-
-@_kernel("void(float64[:,::1], float64[:,::1], float32[:,::1])")
-def sparse_codes(gains: Float64, gram: Float64, codes: Float32) -> None:
-    """Non-negative sparse codes, by active sets (Lawson and Hanson).
-
-    The atom with the highest gain enters the active set; atoms whose code becomes negative leave it.
-
-    `gains` are those at code 0. The Gram matrix of the set is stored as a Cholesky factor with an inverted diagonal,
-    with the solution of its forward substitution: an atom that enters adds one row to both.
-    """
-    count = len(gram)
-    code, solution, forward, gain = np.empty(count), np.empty(count), np.empty(count), np.empty(count)
-    active, factor = np.empty(count, np.int64), np.empty((count, count))
-    for row in range(len(codes)):
-        start, size = gains[row], 0
-        for atom in range(count):
-            gain[atom] = start[atom]
-        for _ in range(3 * count):
-            highest, best = gain[0], 0
-            for atom in range(1, count):
-                highest = max(highest, gain[atom])
-            if highest <= 1e-6:
-                break
-            while gain[best] < highest:
-                best += 1
-            active[size], code[size] = best, 0.0
-            valid, size = size, size + 1
-            while size:
-                for i in range(valid, size):
-                    alike = gram[active[i]]
-                    for j in range(i):
-                        total = alike[active[j]]
-                        for k in range(j):
-                            total -= factor[i, k] * factor[j, k]
-                        factor[i, j] = total * factor[j, j]
-                    total, ahead = alike[active[i]], start[active[i]]
-                    for k in range(i):
-                        total -= factor[i, k] * factor[i, k]
-                        ahead -= factor[i, k] * forward[k]
-                    factor[i, i] = 1 / np.sqrt(max(total, 1e-9))
-                    forward[i] = ahead * factor[i, i]
-                for i in range(size):
-                    solution[i] = forward[i]
-                for i in range(size - 1, -1, -1):
-                    solution[i] *= factor[i, i]
-                    for k in range(i):
-                        solution[k] -= factor[i, k] * solution[i]
-                way, out = 1.0, -1
-                for i in range(size):
-                    if solution[i] <= 0:
-                        now = code[i]
-                        part = now / (now - solution[i]) if now > 0 else 0.0
-                        if part < way:
-                            way, out = part, i
-                for i in range(size):
-                    code[i] += way * (solution[i] - code[i])
-                if out < 0:
-                    break
-                size -= 1
-                for i in range(out, size):
-                    active[i], code[i] = active[i + 1], code[i + 1]
-                valid = out
-            for atom in range(count):
-                gain[atom] = start[atom]
-            for i in range(size):
-                weight, alike = code[i], gram[active[i]]
-                for atom in range(count):
-                    gain[atom] -= weight * alike[atom]
-            for i in range(size):
-                gain[active[i]] = 0
-        for i in range(size):
-            codes[row, active[i]] = code[i]

@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 
 from catstream.base.box import Window
-from catstream.features.kernels import average, sample
 from catstream.features.layout import CELL, MARGIN, WINDOW
+from catstream.features.sampling import average, sample
 
 _MAX_CELLS = 62_500  # of the region around a tiny window: bounds the cost of a large frame
 _OVERLAP = WINDOW + 2 * MARGIN  # minimum overlap of adjacent parts of a region, in cells: a window and its margin

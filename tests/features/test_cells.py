@@ -6,9 +6,9 @@ import pytest
 from numba import config
 
 from catstream.features import cells as features
-from catstream.features import kernels, layout
+from catstream.features import compilation, kernels, layout
 from catstream.features.cells import Cells
-from catstream.features.kernels import COMPILING
+from catstream.features.compilation import COMPILING
 from catstream.features.layout import CELL, CHANNELS, COLOURS, MARGIN, ROW_LENGTH, SHADES
 from catstream.features.pyramid import planes_of
 
@@ -156,10 +156,10 @@ def compiles(monkeypatch, caplog):
     def make(folder):
         monkeypatch.setattr(config, "CACHE_DIR", str(folder))
         monkeypatch.setattr(config, "CACHE_LOCATOR_CLASSES", "UserProvidedCacheLocator")
-        kernels._announce.cache_clear()
+        compilation._announce.cache_clear()
         caplog.clear()
         numbers = np.arange(3, dtype=np.uint8)
-        kernels._kernel("void(uint8[:])")(doubled)(numbers)
+        compilation.kernel("void(uint8[:])")(doubled)(numbers)
         assert numbers.tolist() == [0, 2, 4]
         assert caplog.messages in ([], [COMPILING])
         return bool(caplog.messages)
