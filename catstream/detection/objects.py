@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from copy import copy
 from dataclasses import replace
+from itertools import permutations
 
 import numpy as np
 
@@ -145,9 +146,10 @@ class Claim:
 
     def __init__(self, name: str, detection: Detection, state: DetectorState) -> None:
         self.name = name
-        self.detection = detection
         self.state = state
+        self.detection = detection
         self.box = detection.window.box()
+        self.score = detection.score  # also after `assign` has moved the other two
         # Most likely, such an object is absent or occluded, and a part of another object resembles it.
         self.is_uncertain = state.level != "confident" or detection.redetected
         # False also for an object whose position an uncertain one claims with a clearly higher score.
@@ -159,18 +161,26 @@ class Claim:
         are_together = one.together.get(other.name) == two.first_frame or two.together.get(self.name) == one.first_frame
         return self is not other and not are_together
 
-    def conflicts(self, positions: Mapping[Claim, Box]) -> bool:
+    def yields_to(self, other: Claim) -> bool:
+        """Return True if another object, an uncertain one, has a clearly higher score at the same position."""
+        return other.is_uncertain and self.score < other.score - _LEAD and _conflict(self.box, other.box)
+
+    def overlaps(self, others: Iterable[Claim]) -> bool:
+        """Return True if it is at the position of another object."""
+        return any(self.excludes(other) and _conflict(self.box, other.box) for other in others)
+
+    def conflicts(self, others: Iterable[Claim]) -> bool:
         """Return True if it conflicts with a certain object, or, unless it is certain, with one of a higher score."""
         return any(
-            (other.is_certain or (not self.is_certain and other.detection.score >= self.detection.score))
+            (other.is_certain or (not self.is_certain and other.score >= self.score))
             and self.excludes(other)
-            and _conflict(self.box, box, self.is_uncertain)
-            for other, box in positions.items()
+            and _conflict(self.box, other.box, self.is_uncertain)
+            for other in others
         )
 
-    def elsewhere(self, positions: Mapping[Claim, Box]) -> Detection:
+    def elsewhere(self, others: Iterable[Claim]) -> Detection:
         """Return the best window near the detection outside the positions of others; its score is 0 without one."""
-        occupied = [box for other, box in positions.items() if self.excludes(other)]
+        occupied = [other.box for other in others if self.excludes(other)]
         if (around := self.detection.around) is not None:
             for index in np.argsort(-around.scores, axis=None, kind="stable"):
                 row, column = map(int, np.unravel_index(index, around.scores.shape))
@@ -196,29 +206,25 @@ def assign(detections: Mapping[str, Detection], states: Mapping[str, DetectorSta
     """
     claims = [Claim(name, detections[name], state) for name, state in states.items() if not state.is_sought]
     # Step 1: an object is not certain if an uncertain one scores clearly higher at its position.
-    for claim in claims:
-        for other in claims:
-            if other.is_uncertain and claim.detection.score < other.detection.score - _LEAD:
-                claim.is_certain &= not _conflict(claim.box, other.box)
-    # Step 2: objects without a conflict keep their positions.
-    claimed = {claim: claim.box for claim in claims}
-    disputed = [claim for claim in claims if claim.conflicts(claimed)]
-    assigned = {claim: claim.box for claim in claims if claim not in disputed}
-    # Step 3: of the rest, the certain ones come first, then those that would lose most. Each keeps its position if it
-    # is free. Otherwise, it gets one that is neither assigned nor claimed by a later object.
-    disputed.sort(
-        key=lambda claim: (claim.is_certain, claim.detection.score - claim.elsewhere(claimed).score), reverse=True
-    )
-    result = dict(detections)
+    for claim, other in permutations(claims, 2):
+        claim.is_certain &= not claim.yields_to(other)
+    # Step 2: objects without a conflict keep their positions. Of the rest, the certain ones come first, then those that
+    # would lose most.
+    disputed = [claim for claim in claims if claim.conflicts(claims)]
+    disputed.sort(key=lambda claim: (claim.is_certain, claim.score - claim.elsewhere(claims).score), reverse=True)
+    # Step 3: each keeps its position if it is free. Otherwise, it gets one that is neither assigned nor claimed by a
+    # later object.
+    pending = set(disputed)
+    assigned = set(claims) - pending
     for claim in disputed:
         # An object of a lower score that had more to lose may be there.
-        is_taken = any(claim.excludes(other) and _conflict(claim.box, box) for other, box in assigned.items())
-        if is_taken or claim.conflicts(assigned):
-            result[claim.name] = claim.elsewhere(claimed | assigned)
-        if result[claim.name].score > 0:
-            assigned[claim] = result[claim.name].window.box()
-        del claimed[claim]
-    return result
+        if claim.overlaps(assigned) or claim.conflicts(assigned):
+            claim.detection = claim.elsewhere(assigned | pending)
+            claim.box = claim.detection.window.box()
+        pending.remove(claim)
+        if claim.detection.score > 0:
+            assigned.add(claim)
+    return {**detections, **{claim.name: claim.detection for claim in claims}}
 
 
 def _without_separated(state: DetectorState, states: Mapping[str, DetectorState]) -> DetectorState:
