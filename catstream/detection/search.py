@@ -9,6 +9,7 @@ import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from itertools import cycle
 
 import numpy as np
 
@@ -60,7 +61,7 @@ def find(context: FrameContext, state: DetectorState) -> Detection:
     The whole frame is searched at 0.8, 1 and 1.25 times the last confident size. If it has more than `_MAX_CELLS` cells
     at the three sizes, each frame is searched in part; every second part is around the window, if the window is tiny.
     """
-    settings, frame, first = context.settings, context.pyramid, state.first_window
+    settings, first = context.settings, state.first_window
     last_confident = state.confident_window.centred(*state.window.centre)  # its size, at the predicted centre
     if settings.search.mode == "full":
         doubtful = not state.trusted or state.level == "lost"
@@ -74,17 +75,13 @@ def find(context: FrameContext, state: DetectorState) -> Detection:
     interval = belief.policies(settings.search.full_interval)[level].search_interval
     if not interval:
         return nearby
-    # Step 2: select the part of the whole frame that is due.
+    # Step 2: search the part of the whole frame that is due.
     regions = tuple(region for _, region in _whole_frame(context, last_confident, _FULL_FACTORS))
-    around = _turns(last_confident.w, last_confident.h, regions)
-    everywhere = _turns(last_confident.w, last_confident.h, (frame.region,) * len(regions))
-    is_tiny = around != everywhere
-    number = due_part(context.seq, interval, len(everywhere) * (2 if is_tiny else 1))
+    batches = _batches(last_confident.w, last_confident.h, regions, context.pyramid.region)
+    number = due_part(context.seq, interval, len(batches))
     if number is None:
         return nearby
-    number, is_second = divmod(number, 2) if is_tiny else (number, True)
-    turns = everywhere if is_second else around
-    elsewhere = _best_of(context, turns[number % len(turns)], last_confident)
+    elsewhere = _best_of(context, batches[number], last_confident)
     # Step 3: replace the best window nearby if the score elsewhere is clearly higher, and not lower once it is refined.
     if elsewhere.score > max(settings.belief.confident_score, nearby.score + _REDETECTION_MARGIN):
         elsewhere = fit_extent(context, local_search(context, elsewhere.window), first)
@@ -161,21 +158,26 @@ def _whole_frame(context: FrameContext, window: Window, factors: Iterable[float]
 
 
 @lru_cache(maxsize=8)  # a 4K frame has thousands of parts for a tiny window
-def _turns(width: float, height: float, regions: tuple[Region, ...]) -> list[list[_Part]]:
-    """Split the region of each size into parts, and group them into turns of at most `_MAX_CELLS` cells."""
-    turns: list[list[_Part]] = []
-    room = 0.0
-    for factor, region in zip(_FULL_FACTORS, regions, strict=True):
-        sized = Window(0.0, 0.0, width, height).scaled(factor)
-        parts = region.split(sized, _MAX_CELLS)
-        cells = parts[0].cells(sized)  # as many as in the other parts
-        for part in parts:
-            if not turns or cells > room:
-                turns.append([])
-                room = _MAX_CELLS
-            turns[-1].append((factor, part))
-            room -= cells
-    return turns
+def _batches(width: float, height: float, regions: tuple[Region, ...], frame: Region) -> list[list[_Part]]:
+    """Group the parts of a frame into batches, one for each search, of at most `_MAX_CELLS` cells.
+
+    If the regions around a tiny window are smaller than the frame, every second batch is of the regions.
+    """
+    around: list[list[_Part]] = []
+    everywhere: list[list[_Part]] = []
+    for batches, areas in ((around, regions), (everywhere, (frame,) * len(regions))):
+        cells_left = 0.0
+        for factor, region in zip(_FULL_FACTORS, areas, strict=True):
+            sized = Window(0.0, 0.0, width, height).scaled(factor)
+            parts = region.split(sized, _MAX_CELLS)
+            cells = parts[0].cells(sized)  # as many as in the other parts
+            for part in parts:
+                if cells > cells_left:
+                    batches.append([])
+                    cells_left = _MAX_CELLS
+                batches[-1].append((factor, part))
+                cells_left -= cells
+    return everywhere if around == everywhere else [batch for pair in zip(cycle(around), everywhere) for batch in pair]
 
 
 def _best_of(context: FrameContext, parts: list[_Part], window: Window) -> Detection:
