@@ -108,17 +108,23 @@ def resume_at(position: Position, after: int | None, desired: DesiredState, *, l
     """
     # Step 1: the last message of both. Frames of a live source cannot be read again: it continues after the last one
     # that was learned from.
-    after = position.processed if live or after is None else after
-    seq, repeats = min(after, position.processed), max(after, position.processed)
-    earlier = {name: item for name, item in desired.objects.items() if item.begins <= seq}
+    if live or after is None:
+        after = position.processed
+    seq, repeats = sorted((after, position.processed))
     # Step 2: if no object has a model yet, a file is tracked again from the first frame of the first object.
-    if earlier and not live and not position.versions:
-        return Start(min(item.begins for item in earlier.values()) - 1, repeats, desired, {})
+    if not (live or position.versions):
+        seq = min([seq, *(item.begins - 1 for item in desired.objects.values())])
+        return Start(seq, repeats, desired, {})
     # Step 3: objects with a model continue. The others begin again at their last known boxes, or are searched for with
     # their saved models.
-    states = {name: state for name, state in position.states.items() if name in earlier and name in position.versions}
-    for name, item in earlier.items():
-        if name not in states:
+    trained = position.states.keys() & position.versions.keys()
+    states: dict[str, DetectorState] = {}
+    for name, item in desired.objects.items():
+        if item.begins > seq:
+            continue
+        if name in trained:
+            states[name] = position.states[name]
+        else:
             state = None if item.model else position.states.get(name)
             box = item.box if state is None else state.window.box()
             desired = desired.with_object(name, replace(item, box=box, begins=seq + 1))
