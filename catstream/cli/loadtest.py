@@ -115,7 +115,7 @@ def loadtest(
     newer one. Slow subscribers read two tracks per second.
 
     \b
-    LIMITS, of the worst stream
+    LIMITS, of the worst stream (0.1 or 100ms, 0.01 or 1%)
       p50 p95 p99 p99.9 max     seconds from a frame to its track, at most
       model-p50 ... model-max   seconds from a frame to the model trained on it, at most
       skipped                   share of frames that were not tracked, at most
@@ -133,7 +133,7 @@ def loadtest(
 
     \b
     EXAMPLES
-      catstream loadtest --rate 30 --limit p99=0.1
+      catstream loadtest --rate 30 --limit p99=100ms
       catstream loadtest --objects 8 --limit skipped=0.01
       catstream loadtest --video recording.mp4 --box 120,80,64,48 --limit success=0.95
       catstream loadtest --subscribers 500 --limit subscriber-p99=0.05 --report load.html

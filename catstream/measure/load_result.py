@@ -188,8 +188,8 @@ class Result:
 class Limit:
     """A limit on one of the `KINDS`: a minimum of the success, a maximum of the others.
 
-    >>> Limit.parse("p99=0.1")
-    Limit(name='p99', value=0.1)
+    >>> Limit.parse("p99=0.1"), Limit.parse("skipped=1%")
+    (Limit(name='p99', value=0.1), Limit(name='skipped', value=0.01))
     """
 
     name: str
@@ -197,10 +197,11 @@ class Limit:
 
     @classmethod
     def parse(cls, text: str) -> Limit:
-        """Read `NAME=VALUE`; times are in seconds."""
+        """Read `NAME=VALUE`; times are in seconds, or end with `ms`, and shares may end with `%`."""
         name, _, number = text.partition("=")
+        unit, factor = ("%", 0.01) if name in SHARES else ("ms", 0.001)
         try:
-            value = float(number)
+            value = float(number.removesuffix(unit)) * (factor if number.endswith(unit) else 1)
         except ValueError:
             value = float("nan")
         if name not in KINDS or not 0 <= value < float("inf"):
