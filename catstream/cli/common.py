@@ -9,6 +9,7 @@ import json
 import os
 import signal
 import sys
+import time
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -25,6 +26,9 @@ if TYPE_CHECKING:
     from rich.table import Table
 
 _SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
+#: Seconds between two lines about long work if the messages do not go to a terminal.
+LINE_SECONDS = 30.0
+
 _WIDTH = 140  # columns of a table that is not printed to a terminal
 
 
@@ -58,15 +62,24 @@ def table(*heads: str, right: Collection[str] = ()) -> Table:
 
 
 def line_of(console: Console, *columns: ProgressColumn) -> Progress:
-    """A progress display of one line, which is erased at its end; nothing if the console is not a terminal.
+    """A progress display of one line, which is erased at its end; without a terminal, a line every half minute.
 
     columns : by default the description, a bar, how much of the total is done, and the time that remains
     """
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TimeRemainingColumn
+
+    class Line(Progress):
+        printed = time.monotonic()
+
+        def update(self, task_id: TaskID, **fields: Any) -> None:
+            super().update(task_id, **fields)
+            if self.disable and time.monotonic() > self.printed + LINE_SECONDS:
+                self.printed = time.monotonic()
+                console.print(*(part(self.tasks[task_id]) for part in parts if not isinstance(part, BarColumn)))
 
     parts = columns or (text("{task.description}"), BarColumn(24), MofNCompleteColumn(), TimeRemainingColumn())
     hidden, wide = not console.is_terminal, parts[-1].get_table_column().ratio is not None
-    return Progress(*parts, console=console, transient=True, expand=wide, refresh_per_second=8, disable=hidden)
+    return Line(*parts, console=console, transient=True, expand=wide, refresh_per_second=8, disable=hidden)
 
 
 def text(form: str, *, last: bool = False) -> TextColumn:

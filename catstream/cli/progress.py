@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from catstream.base.names import UNNAMED
 from catstream.base.text import counted
+from catstream.cli.common import LINE_SECONDS
 from catstream.pipeline import Pipeline
 from catstream.video.frames import describe_counters
 from catstream.wire.messages import Track
@@ -40,7 +41,7 @@ class RunProgress:
         self._pipeline = pipeline
         self._held, self._looked = 0.0, time.perf_counter()  # seconds while the run was held, and until when
         self._started = self._now()
-        self._first = self._refreshed = 0.0
+        self._first, self._refreshed = 0.0, self._looked
         self.frames = self.not_written = 0
         self._objects: dict[str, _ObjectCounts] = {}
         self._tracks: Mapping[str, Track] = {}  # of the newest frame
@@ -67,12 +68,16 @@ class RunProgress:
             self._held += self._looked - before
 
     def show(self, status: Status, console: Console) -> None:
-        """Update the line on a terminal, at most ten times a second."""
-        if console.is_terminal and self._looked - self._refreshed >= REFRESH_SECONDS:
-            self._refreshed = self._looked
+        """Update the line on a terminal, at most ten times a second; else print it at times, but not of a camera."""
+        if self._looked - self._refreshed < (REFRESH_SECONDS if console.is_terminal else LINE_SECONDS):
+            return
+        self._refreshed = self._looked
+        if console.is_terminal:
             from rich.text import Text
 
             status.update(Text(self.line(), no_wrap=True, overflow="ellipsis"))
+        elif not self._pipeline.live:
+            console.print(self.line())
 
     def line(self) -> str:
         """The state of the objects, or why they have none, and figures of the newest frame."""

@@ -1,5 +1,6 @@
 """What the commands share: the progress line and the summary of a run, and Ctrl-C between frames and within one."""
 
+import io
 import os
 import signal
 import subprocess
@@ -7,9 +8,11 @@ import sys
 from types import SimpleNamespace
 
 import pytest
+from rich.console import Console
 
 from catstream.base.box import Box
-from catstream.cli.common import Interrupts
+from catstream.cli import common
+from catstream.cli.common import Interrupts, line_of
 from catstream.cli.progress import RunProgress
 from catstream.processes.job import Results
 from catstream.wire.messages import Track
@@ -24,6 +27,16 @@ def counted(seen, **pipeline):
     for tracks in seen:
         progress.count(tracks)
     return progress
+
+
+def test_progress_without_a_terminal_is_a_line_now_and_then(monkeypatch):
+    screen = Console(file=io.StringIO())
+    with line_of(screen) as progress:
+        task = progress.add_task("reading", total=3)
+        progress.update(task, advance=1)
+        monkeypatch.setattr(common, "LINE_SECONDS", -1.0)
+        progress.update(task, advance=1)
+    assert screen.file.getvalue().split() == ["reading", "2/3", "-:--:--"]
 
 
 @pytest.mark.parametrize("live", [False, True], ids=["file", "live"])
