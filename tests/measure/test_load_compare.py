@@ -14,7 +14,9 @@ from catstream.measure.load_test import LoadTest
 @pytest.fixture
 def before(result, tmp_path):
     """A result as it is read from its file."""
-    (tmp_path / "x.json").write_text(json.dumps(to_json(LoadTest([], results=[result([0.01] * 50)]), {"command": "catstream loadtest"})))
+    (tmp_path / "x.json").write_text(
+        json.dumps(to_json(LoadTest([], results=[result([0.01] * 50)]), {"command": "catstream loadtest"}))
+    )
     return read_result(tmp_path / "x.json")
 
 
