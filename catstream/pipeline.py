@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Literal, Self
 
 from catstream.base.addresses import without_password
 from catstream.base.forks import check_not_forked, forked, generation
-from catstream.errors import ServiceError, SettingsError
+from catstream.errors import ObjectError, ServiceError, SettingsError
 from catstream.processes.start_server import start_server
 
 if TYPE_CHECKING:  # the methods import them, so that the constructor starts the server first
@@ -93,6 +93,8 @@ class Pipeline:
         Whether the source is a camera or a stream.
     source, boxes, part, settings
         The values of the run, also if it is resumed; the path of a source is absolute.
+    state : Path or None
+        The folder of the state, absolute; None without one.
     results, earlier_results : Results
         The files that the program writes, including those of the resumed run; and the files of the resumed run alone.
     first_frame : int or None
@@ -136,6 +138,7 @@ class Pipeline:
     ) -> None:
         _check_exclusive(state, resume, box, model)
         start_server()  # it imports while this process imports and opens the source
+        from catstream.base.names import UNNAMED
         from catstream.processes.job import Job, Results
         from catstream.processes.probe import probe
         from catstream.processes.state import check_new
@@ -143,19 +146,21 @@ class Pipeline:
 
         text = None if source is None else source_text(source)
         self._earlier: Job | None = None
-        self._state = None if state is None else Path(state).absolute()
-        if self._state is not None:
-            check_new(self._state)
+        self.state = None if state is None else Path(state).absolute()
+        if self.state is not None:
+            check_new(self.state)
         if resume is None:
             job = Job.new(text, box, settings, models=model, part=part, results=results, paused=paused)
         else:
-            self._earlier, self._state = Job.load(Path(resume)), Path(resume).absolute()
+            self._earlier, self.state = Job.load(Path(resume)), Path(resume).absolute()
             job = self._earlier.resumed(text, settings, part=part, results=results, paused=paused)
         self._save_models = job.results.models if save_model is None else _writable(save_model)
+        if UNNAMED in self._save_models and len(job.boxes) + len(job.models) > 1:
+            raise ObjectError("a saved model without a name is for a single object: pass NAME=FILE for each of several")
         job, info = probe(job)
         self._job = job
-        if self._earlier is not None and self._state is not None:
-            self._earlier.check_fits(job, self._state)
+        if self._earlier is not None and self.state is not None:
+            self._earlier.check_fits(job, self.state)
         self.name, self.frames, self.rate, self.size, self.live = info
         self.source, self.boxes, self.part, self.settings = job.source, job.boxes, job.part, job.settings
         self.results, self.earlier_results = job.results, self._earlier.results if self._earlier else Results()
@@ -180,10 +185,10 @@ class Pipeline:
             folder = stack.enter_context(private_folder())
             settings, source = self.settings, without_password(self.source)
             endpoint = stack.enter_context(reserve_endpoint(settings.run.endpoint, folder, settings.run.keys, source))
-            if self._state is not None:
-                stack.enter_context(locked_for_run(self._state, self._earlier, self._job))
+            if self.state is not None:
+                stack.enter_context(locked_for_run(self.state, self._earlier, self._job))
             job = self._started(str(endpoint))
-            state = self._state or folder
+            state = self.state or folder
             stack.enter_context(saved(self._save_models, state, settings, self.saved_models.append))
             self._supervisor = Supervisor(job, folder, self._start)
             stack.callback(self._supervisor.stop)  # before the models are saved, from the compressor's last checkpoint
@@ -198,14 +203,14 @@ class Pipeline:
         measures it if the clock of the machine was set meanwhile.
         """
         passed = 0.0
-        if self.live and self._earlier is not None and self._state is not None:
+        if self.live and self._earlier is not None and self.state is not None:
             from catstream.processes.state import position
 
-            passed = max(position(self._state)[1], self.first_time) + self.settings.run.checkpoint_seconds
+            passed = max(position(self.state)[1], self.first_time) + self.settings.run.checkpoint_seconds
         return replace(
             self._job,
             endpoint=endpoint,
-            state=self._state,
+            state=self.state,
             resume=self._earlier is not None,
             since=time.monotonic() - passed,
             first=self._start if self.live else 0,
@@ -380,14 +385,14 @@ class Pipeline:
     @property
     def _start(self) -> int:
         """Number of the last frame before the run, which the caller or the checkpoint has."""
-        if self._earlier is None or self._state is None:
+        if self._earlier is None or self.state is None:
             return 0
         from catstream.processes.state import position
 
         # Frames of a live source cannot be read again: the checkpoint may be ahead of the tracks.
         if self.first_frame is not None and not self.live:
             return self.first_frame
-        return max(position(self._state)[0], self.first_frame or 0)
+        return max(position(self.state)[0], self.first_frame or 0)
 
 
 def _check_exclusive(state: object, resume: object, box: object, model: object) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from itertools import combinations
@@ -21,6 +21,7 @@ from catstream.cli.common import INTERRUPTS, messages, stopped
 from catstream.cli.options import (
     FOLDER,
     PATH,
+    combined,
     with_files,
     with_object,
     with_overrides,
@@ -70,16 +71,36 @@ def _files_only(_: click.Context, __: click.Parameter, destinations: tuple[str, 
     return destinations
 
 
+#: Adds the options for files to write, as the argument `outputs`: the files, and whether tracks go to standard output.
+_with_outputs = combined(
+    "outputs",
+    lambda output, video, write, rotate, keep, saved: (
+        Results(  # absolute, to resume from any folder; a resumed run keeps the files that are None
+            output=output and output.absolute(),
+            video=video,
+            write=tuple(Path(dest).absolute() for dest in write if dest != STDOUT) if write else None,
+            models={name: file.absolute() for name, file in saved.items()},
+            rotate=rotate,
+            keep=keep,
+        ),
+        STDOUT in write,
+    ),
+    click.option("--output", type=FOLDER, metavar="DIR", help="Folder for the results."),
+    click.option("--video/--no-video", default=None, help="Also write the annotated video."),
+    click.option(
+        "--write", multiple=True, metavar="FILE", callback=_files_only, help="Write tracks to FILE; repeatable."
+    ),
+    click.option("--rotate", metavar="1d|500MB", help="Rotate the files of a live source."),
+    click.option("--keep", type=click.IntRange(min=1), metavar="N", help="Rotated files to keep."),
+    with_overwrite,
+    with_files("--save-model", "saved", "Save the model of an object at the end."),
+)
+
+
 @click.command()
 @click.argument("source", required=False)
 @with_object
-@click.option("--output", type=FOLDER, metavar="DIR", help="Folder for the results.")
-@click.option("--video/--no-video", default=None, help="Also write the annotated video.")
-@click.option("--write", multiple=True, metavar="FILE", callback=_files_only, help="Write tracks to FILE; repeatable.")
-@click.option("--rotate", metavar="1d|500MB", help="Rotate the files of a live source.")
-@click.option("--keep", type=click.IntRange(min=1), metavar="N", help="Rotated files to keep.")
-@with_overwrite
-@with_files("--save-model", "saved", "Save the model of an object at the end.")
+@_with_outputs
 @with_view
 @click.option("--paused", is_flag=True, help="Start paused, until `catstream resume`.")
 @click.option("--state", type=PATH, metavar="DIR", help="Write checkpoints to this folder.")
@@ -93,13 +114,8 @@ def track(
     source: str | None,
     boxes: dict[str, Box],
     models: dict[str, Path],
-    output: Path | None,
-    video: bool | None,
-    write: tuple[str, ...],
-    rotate: str | None,
-    keep: int | None,
+    outputs: tuple[Results, bool],
     overwrite: bool,
-    saved: dict[str, Path],
     view: HostPort | None,
     paused: bool,
     state: Path | None,
@@ -131,23 +147,15 @@ def track(
       catstream track 0 --model walker --output out --state checkpoints --continue
       catstream track --resume checkpoints
     """
-    if state and resume:
-        raise click.UsageError("--state and --resume are mutually exclusive (new run / existing run)")
-    if continues and not state:
-        raise click.UsageError("missing --state DIR: --continue needs the folder of the run, which it may create")
-    if not resume and not source:
-        raise click.UsageError("missing SOURCE: a video, a folder of images, a camera or a stream")
-    if (resume or continues) and overwrite:
-        option = "--continue" if continues else "--resume"
-        raise click.UsageError(
-            f"{option} and --overwrite are mutually exclusive (continue / replace the existing results)"
-        )
-    if UNNAMED in saved and len(boxes) + len(models) > 1:
-        raise click.UsageError("--save-model FILE is for a single object: pass NAME=FILE for each of several")
-    notes: list[str] = []
-    if continues and state is not None and contains_run(state):
-        resume, state, boxes, models = state, None, {}, {}
-        notes.append(f"the resumed run in {resume} keeps its objects")
+    if overwrite and (resume or continues):
+        raise click.UsageError("--overwrite replaces existing results, --resume and --continue continue them: omit one")
+    results, to_stdout = outputs
+    if continues:
+        if state is None:
+            raise click.UsageError("missing --state DIR: --continue needs the folder of the run, which it may create")
+        if contains_run(state):
+            click.echo(f"the resumed run in {state} keeps its objects", err=True)
+            resume, state, boxes, models = state, None, {}, {}
     pipeline = Pipeline(
         source,
         boxes or None,
@@ -157,28 +165,14 @@ def track(
         state=state,
         resume=resume,
         paused=paused,
-        results=Results(  # absolute, to resume from any folder; a resumed run keeps the files that are None
-            output=output and output.absolute(),
-            video=video,
-            write=tuple(Path(dest).absolute() for dest in write if dest != STDOUT) if write else None,
-            models={name: file.absolute() for name, file in saved.items()},
-            rotate=rotate,
-            keep=keep,
-        ),
+        results=results,
     )
-    run = _Run(pipeline, resume or state, resume is not None, STDOUT in write, overwrite, view)
+    run = _Run(pipeline, resume is not None, to_stdout, overwrite, view)
     run.check()
-    notes += _doubtful(boxes, *pipeline.size)
-    objects = {*boxes, *models}
-    if objects and (unknown := saved.keys() - objects - {UNNAMED}):  # without a name, the only one is meant
-        names = listed(sorted(unknown))
-        notes.append(f"there is no object {names} yet: its model is saved if one begins under this name")
     console = messages()
-    for line in notes:
-        console.print(line)
+    _print(console, _doubtful(boxes, models, results.models, *pipeline.size))
     outcome = run.execute(console)
-    for line in outcome.lines():
-        console.print(line)
+    _print(console, outcome.lines())
     if outcome.interrupted:
         stopped(outcome.interruption())
 
@@ -233,15 +227,13 @@ class Outcome:
 class _Run:
     """A run with its files.
 
-    folder      folder of the state; None for none
-    is_resumed  whether the run of the folder continues
+    is_resumed  whether the run of a state folder continues
     stdout      whether tracks are also written to standard output
     overwrite   whether existing files are replaced
     view        address of the web page; None for none
     """
 
     pipeline: Pipeline
-    folder: Path | None
     is_resumed: bool
     stdout: bool
     overwrite: bool
@@ -262,8 +254,8 @@ class _Run:
         if results.video and results.output is None:
             raise click.UsageError("--video requires --output, the folder for the video")
         others = {f"the saved model of {name or 'the object'}": file for name, file in results.models.items()}
-        if self.folder is not None:
-            others |= files_of_state(self.folder)
+        if pipeline.state is not None:
+            others |= files_of_state(pipeline.state)
         earlier = destinations_of(pipeline.name, pipeline.earlier_results)
         files.check(overwrite=self.overwrite, earlier=earlier, others=others)
         for file in set(results.models.values()) - set(pipeline.earlier_results.models.values()):
@@ -274,7 +266,7 @@ class _Run:
         pipeline, files, models = self.pipeline, self.files, [*self.pipeline.results.models.values()]
         if self.is_resumed:
             if all(file.exists() for file in models) and files.is_complete(pipeline.frames):
-                return Outcome(self.folder, is_resumed=True)
+                return Outcome(pipeline.state, is_resumed=True)
             skip_damaged = pipeline.settings.run.skip_damaged
             pipeline.first_frame, pipeline.first_time = files.position(skip_damaged=skip_damaged)
         page = None if self.view is None else self._page(self.view)  # a port in use is an error before the run
@@ -293,7 +285,7 @@ class _Run:
                 console.print(progress.summary())
         missing = files.missing() if progress.frames else ()
         saved = pipeline.saved_models
-        return Outcome(self.folder, self.is_resumed, progress.frames, missing, models, saved, interrupted)
+        return Outcome(pipeline.state, self.is_resumed, progress.frames, missing, models, saved, interrupted)
 
     @staticmethod
     def _page(view: HostPort) -> tuple[PipelineFeed, Server]:
@@ -354,15 +346,22 @@ class _Run:
             console.print(f"paused: to continue, catstream resume {endpoint}")
 
 
-def _doubtful(boxes: Mapping[str, Box], width: int, height: int) -> list[str]:
-    """Descriptions of boxes that can be tracked, but are probably a mistake.
+def _print(console: Console, lines: Iterable[str]) -> None:
+    for line in lines:
+        console.print(line)
+
+
+def _doubtful(
+    boxes: Mapping[str, Box], models: Collection[str], saved: Collection[str], width: int, height: int
+) -> list[str]:
+    """Descriptions of objects that can be tracked, but are probably a mistake.
 
     The box is the whole frame, or two objects have the same box; or the box reaches out of the frame or covers more
-    than a quarter of it, and its four numbers may be two corners.
+    than a quarter of it, and its four numbers may be two corners. Or a model is to be `saved` under another name.
 
-    >>> _doubtful({"anna": Box(8, 9, 40, 40), "ben": Box(8, 9, 40, 40)}, 320, 240)
+    >>> _doubtful({"anna": Box(8, 9, 40, 40), "ben": Box(8, 9, 40, 40)}, {}, {}, 320, 240)
     ['anna and ben have the same box: each costs time']
-    >>> print(*_doubtful({"": Box(213, 121, 234, 216)}, 352, 288))
+    >>> print(*_doubtful({"": Box(213, 121, 234, 216)}, {}, {}, 352, 288))
     a box of 234x216 in a frame of 352x288: if 213,121,234,216 are two corners, pass 213,121,21,95
     """
     whole = Box(0, 0, width, height)
@@ -380,6 +379,10 @@ def _doubtful(boxes: Mapping[str, Box], width: int, height: int) -> list[str]:
         and x + y > 0
         and (x + w > width or y + h > height or 4 * w * h > width * height)
     ]
+    objects = {*boxes, *models}
+    if objects and (unknown := {*saved} - objects - {UNNAMED}):  # without a name, the only one is meant
+        names = listed(sorted(unknown))
+        doubts.append(f"there is no object {names} yet: its model is saved if one begins under this name")
     return doubts + [
         f"{one} and {other} have the same box: each costs time"
         for (one, box), (other, twin) in combinations(boxes.items(), 2)

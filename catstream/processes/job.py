@@ -121,7 +121,7 @@ class Job:
         paused: bool = False,
     ) -> Job:
         """The job of a new run, by the arguments of `catstream.Pipeline`; SettingsError without a source."""
-        if source is None:
+        if not source:
             raise SettingsError("missing source: a new run needs a video, a folder of images, a camera or a stream")
         return cls(
             source=source,
