@@ -1,4 +1,4 @@
-"""Live sources: always the newest frame, every other one counted, and never given up."""
+"""Live sources return the newest frame, count skipped frames, and reconnect."""
 
 from __future__ import annotations
 
@@ -8,29 +8,14 @@ from contextlib import suppress
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 
-import av
 import cv2
-import numpy as np
 import pytest
 
 from catstream.base.addresses import without_password
 from catstream.errors import VideoError
-from catstream.video import connection, live, reconnect
+from catstream.video import connection, live
 from catstream.video.source import open_source
-
-
-def numbered(number: int, width: int = 128) -> np.ndarray:
-    """Twelve bits of the number as the greys of both halves, which survive JPEG."""
-    image = np.full((96, width, 3), 4 * (number % 64), np.uint8)
-    image[:, width // 2 :] = 4 * (number // 64)
-    return image
-
-
-def number_of(image: np.ndarray) -> int:
-    """The number that `numbered` wrote."""
-    middle = image.shape[1] // 2
-    low, high = (round(half.mean() / 4) for half in (image[:, : middle - 8], image[:, middle + 8 :]))
-    return low + 64 * high
+from tests.video.pictures import make_video, number_of, numbered, write_video
 
 
 @pytest.fixture
@@ -60,32 +45,29 @@ def served():
         server.server_close()
 
 
-def test_a_stream_has_a_name_and_a_size_also_if_its_password_contains_a_bracket(camera):
-    with open_source(camera(numbered).url.replace("//", "//me:sec[ret@")) as source:
-        assert (source.name, source.frames, source.size, source.live) == ("one", None, (128, 96), True)
-
-
-def test_every_frame_is_returned_or_counted_as_skipped_and_the_last_is_the_newest(camera, until):
-    cam, taken = camera(numbered), []
+def test_every_frame_is_returned_or_counted_as_skipped(camera, until):
+    cam, seen = camera(numbered), []
     with open_source(cam.url) as source:
         for frame in source:
-            taken.append(number_of(frame.image))
-            if len(taken) == 5:
+            seen.append(number_of(frame.image))
+            if len(seen) == 5:
                 break
             skipped = source.counters["skipped"]
             until(lambda: source.counters["skipped"] >= skipped + 3)  # noqa: B023
         cam.sends.clear()
-        while taken[-1] < (sent := cam.sent) - 1:
-            taken.append(number_of(next(source).image))
-        assert sent <= len(taken) + source.counters["skipped"] <= cam.sent  # one more may be on its way
-    assert taken == sorted(set(taken))
-    assert len(taken) < cam.sent / 2
+        while seen[-1] < (sent := cam.sent) - 1:
+            seen.append(number_of(next(source).image))
+        assert sent <= len(seen) + source.counters["skipped"] <= cam.sent  # one more may be on its way
+    assert seen == sorted(set(seen))
+    assert len(seen) < cam.sent / 2
 
 
 @pytest.mark.parametrize(("ago", "rate"), [(None, None), (1000, 12.5)])
-def test_live_frames_are_numbered_from_the_start_and_timed_from_a_moment(camera, ago, rate):
+def test_frames_are_numbered_from_the_start_and_timed(camera, ago, rate):
     since = None if ago is None else time.monotonic() - ago
-    with open_source(camera(numbered).url, start=7, since=since, rate=rate) as source:
+    address = camera(numbered).url.replace("//", "//me:sec[ret@")  # FFmpeg accepts a bracket in a password
+    with open_source(address, start=7, since=since, rate=rate) as source:
+        assert (source.name, source.frames, source.size, source.live) == ("one", None, (160, 120), True)
         frames = [next(source) for _ in range(10)]
         assert source.rate == (rate or pytest.approx(source.rate))
     assert [frame.number for frame in frames] == list(range(7, 17))
@@ -94,35 +76,38 @@ def test_live_frames_are_numbered_from_the_start_and_timed_from_a_moment(camera,
     assert times[0] == 0 if ago is None else times[0] >= ago
 
 
-def test_a_camera_that_disconnects_is_reconnected_and_another_size_is_scaled(camera, until):
+def test_restarted_camera_is_reconnected_and_scaled(camera, until):
     cam = camera(numbered)
     with open_source(cam.url) as source:
         next(source)
         cam.leave()
         until(lambda: source.counters["lost_seconds"] > 0)
         before = source.counters["reconnects"]
-        camera(lambda number: numbered(number, width=256), cam.port)
+        camera(lambda number: numbered(number, 320, 240), cam.port)
         frames = [next(source) for _ in range(3)]
         until(lambda: source.counters["reconnects"] > before)
         until(lambda: source.counters["lost_seconds"] == 0)
     assert [frame.number for frame in frames] == [1, 2, 3]
-    assert {frame.image.shape for frame in frames} == {(96, 128, 3)}, "the size of the first frame"
+    assert {frame.image.shape for frame in frames} == {(120, 160, 3)}, "the size of the first frame"
 
 
-def test_whether_a_source_is_lost_is_known_from_its_first_frame_or_failure_on(camera, until):
-    cam = camera(numbered)
-    cam.sends.clear()
-    with open_source(cam.url, idle=lambda: False) as source:
-        assert "lost_seconds" not in source.counters
-        cam.sends.set()
-        next(source)
-        assert source.counters["lost_seconds"] == 0
-    cam.leave()
-    with open_source(cam.url, idle=lambda: False) as source:
-        until(lambda: source.counters.get("lost_seconds", 0) > 0)
+def test_outage_is_logged_once_and_ends_with_a_frame(monkeypatch, caplog):
+    now = 100.0
+    monkeypatch.setattr(live, "monotonic", lambda: now)
+    outages = live.Outages("gate", is_open=True)
+    assert outages.lost_seconds(60) is None, "neither a frame nor a failure"
+    for now in (101.0, 102.0, 103.0):
+        outages.begin("it is unplugged", now)
+    assert outages.lost_seconds(60) == 3
+    outages.end(now)
+    assert (outages.lost_seconds(60), outages.reconnects) == (0, 1)
+    lost, reconnected = caplog.messages
+    assert (lost, reconnected[-11:]) == ("lost source gate (it is unplugged); reconnecting", "after 3.0 s")
+    now += 61
+    assert outages.lost_seconds(60) == 61, "silent for longer than the limit"
 
 
-def test_a_camera_that_sends_no_frames_is_reconnected(camera, caplog, until):
+def test_silent_camera_is_reconnected(camera, caplog, until):
     cam = camera(numbered)
     with open_source(cam.url, read_timeout_seconds=0.5) as source:
         next(source)
@@ -135,23 +120,7 @@ def test_a_camera_that_sends_no_frames_is_reconnected(camera, caplog, until):
     assert "reconnected to source one after" in caplog.text
 
 
-def test_the_reason_of_a_loss_is_logged_once(camera, monkeypatch, caplog, until):
-    monkeypatch.setattr(reconnect, "_LONGEST_BACKOFF", 0.01)
-    cam, tried = camera(numbered), []
-
-    def refuse(*arguments, **_):
-        tried.append(arguments)
-        raise OSError("it is unplugged")
-
-    with open_source(cam.url) as source:
-        monkeypatch.setattr(connection, "open_video", refuse)
-        cam.leave()
-        until(lambda: len(tried) > 5)
-        assert source.counters["lost_seconds"] > 0
-    assert caplog.text.count("it is unplugged") == 1
-
-
-def test_an_unreachable_stream_is_an_error_without_its_password(camera, caplog):
+def test_unreachable_stream_is_an_error_without_its_password(camera, caplog):
     cam = camera(numbered)
     cam.leave()
     with pytest.raises(VideoError, match=r"cannot open 'http://127.*connection refused.*check") as error:
@@ -160,77 +129,69 @@ def test_an_unreachable_stream_is_an_error_without_its_password(camera, caplog):
     assert not caplog.records, "a first failure is an error, not a loss"
 
 
-def test_a_camera_that_is_silent_at_the_start_is_an_error_that_names_the_timeouts(camera):
+def test_camera_that_is_silent_at_the_start_is_an_error(camera):
     cam = camera(numbered)
     cam.sends.clear()
     with pytest.raises(VideoError, match=r"\(no data\): check the camera; if it is slow, raise run\."):
         open_source(cam.url, open_timeout_seconds=1)
 
 
+def test_missing_camera_is_an_error():
+    with pytest.raises(VideoError, match=r"no such file.*\./987$"):
+        open_source("987")
+
+
 @pytest.mark.parametrize(
-    ("seconds", "left_out", "late"), [(0.03, (0, 0), 0.1), (0.08, (0.4, 0.7), 2.1), (0.5, (0.9, 0.97), 2.6)]
+    ("seconds", "dropped_share", "late"), [(0.03, (0, 0), 0.1), (0.08, (0.4, 0.7), 2.1), (0.5, (0.9, 0.97), 2.6)]
 )
-def test_a_stream_that_is_decoded_too_slowly_continues_at_a_keyframe(seconds, left_out, late):
-    backlog, moment, left, ages, broken = connection.Backlog(), 0.0, 0, [], False
+def test_slowly_decoded_stream_drops_packets_up_to_a_keyframe(seconds, dropped_share, late):
+    backlog, moment, dropped, ages, broken = connection.Backlog(), 0.0, 0, [], False
     for number in range(3000):  # two minutes, with a key frame every second
         moment, is_key = max(moment, number / 25), number % 25 == 0
         if backlog.drops(moment, number / 25, is_key=is_key):
-            left, broken = left + 1, True
+            dropped, broken = dropped + 1, True
             continue
         assert is_key or not broken, "a frame refers to the one before"
         broken, moment = False, moment + seconds
         backlog.is_decoded(moment)
         ages.append(moment - number / 25)
-    low, high = left_out
-    assert low <= left / 3000 <= high
+    low, high = dropped_share
+    assert low <= dropped / 3000 <= high
     assert max(ages) <= late
 
 
-def test_nothing_is_left_out_after_the_network_stood_still():
+def test_packets_delayed_by_the_network_are_not_dropped():
     backlog, moment = connection.Backlog(), 0.0
     for number in range(1000):
-        moment = max(moment, number / 25, 23.0 if number >= 510 else 0.0)  # 510 was due at 20.4
+        moment = max(moment, number / 25, 23.0 if number >= 510 else 0.0)  # 2.6 s late
         assert not backlog.drops(moment, number / 25, is_key=number % 250 == 0)
         moment += 0.005
         backlog.is_decoded(moment)
 
 
-def test_a_camera_that_does_not_exist_is_an_error():
-    with pytest.raises(VideoError, match=r"no such file.*\./987$"):
-        open_source("987")
-
-
-def test_with_an_idle_function_the_first_frame_is_waited_for_too(camera):
-    cam, turns = camera(numbered), []
-    cam.leave()
-
-    def idle() -> bool:
-        turns.append(1)
-        return len(turns) == 2
-
-    with open_source(cam.url, idle=idle) as source:
+def test_idle_function_is_called_until_the_first_frame(camera, until):
+    cam, answers = camera(numbered), iter([False, True])
+    cam.sends.clear()
+    with open_source(cam.url, idle=lambda: next(answers, False)) as source:
+        assert "lost_seconds" not in source.counters, "neither a frame nor a failure"
         assert list(source) == []
+        cam.leave()
+        until(lambda: source.counters.get("lost_seconds", 0) > 0)
         camera(numbered, cam.port)
         assert next(source).number == 0
-        assert source.size == (128, 96)
+        assert source.size == (160, 120)
 
 
-def test_a_closed_source_has_no_frames_and_leaves_no_thread(camera):
+def test_closed_source_has_no_frames_and_no_thread(camera):
     source = open_source(camera(numbered).url)
     source.close()
     assert list(source) == []
     assert not [thread for thread in threading.enumerate() if thread.name == "reader of one"]
 
 
-@pytest.mark.parametrize(("name", "codec"), [("walk.mp4", "mpeg4"), ("walk.h264", "libx264")])
-def test_a_url_of_a_video_file_is_an_error(tmp_path, served, name, codec):
-    options = {"movflags": "faststart"} if name.endswith("mp4") else {}
-    with av.open(str(tmp_path / name), "w", options=options) as container:
-        stream = container.add_stream(codec, rate=25)
-        stream.width, stream.height = 128, 96
-        for number in range(50):
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(numbered(number), format="bgr24")))
-        container.mux(stream.encode(None))
+@pytest.mark.parametrize("name", ["walk.mp4", "walk.h264"])
+def test_url_of_a_video_file_is_an_error(tmp_path, served, name):
+    make_video(tmp_path / name, 50, {"movflags": "faststart"} if name.endswith("mp4") else None)
     with pytest.raises(VideoError, match=r"\(a recording\): download it, and pass the file$"):
         open_source(f"{served(tmp_path)}/{name}")
 
@@ -239,7 +200,7 @@ def jpeg(number: int) -> bytes:
     return cv2.imencode(".jpg", numbered(number))[1].tobytes()
 
 
-#: Parts of MJPEG, with {size} and {jpeg}, as cameras send them and browsers show them.
+#: Parts of MJPEG, with {size} and {jpeg}, as cameras send them.
 PARTS = {
     "standard": b"--b\r\nContent-Type: image/jpeg\r\nContent-Length: %(size)d\r\n\r\n%(jpeg)b\r\n",
     "image/jpg": b"--b\r\nContent-Type: image/jpg\r\nContent-Length: %(size)d\r\n\r\n%(jpeg)b\r\n",
@@ -254,7 +215,7 @@ PARTS = {
 
 
 @pytest.mark.parametrize("part", PARTS.values(), ids=PARTS)
-def test_mjpeg_is_read_whatever_its_parts_say(served, caplog, part):
+def test_mjpeg_is_read_with_any_headers_of_its_parts(served, caplog, part):
     def send(request):
         request.send_response(200)
         request.send_header("Content-Type", 'multipart/x-mixed-replace; boundary="b"')
@@ -271,13 +232,13 @@ def test_mjpeg_is_read_whatever_its_parts_say(served, caplog, part):
 
 @pytest.mark.parametrize("states_length", [True, False])
 @pytest.mark.parametrize("suffix", [".jpg", ".png", ".webp"])
-def test_a_still_picture_is_fetched_again_and_again(served, caplog, suffix, states_length, monkeypatch):
+def test_still_picture_is_polled(served, caplog, suffix, states_length, monkeypatch):
     monkeypatch.setattr(live, "_POLL_SECONDS", 0.05)
     fetched = []
 
     def send(request):
         fetched.append(1)
-        picture = cv2.imencode(suffix, numbered(len(fetched), width=4096))[1].tobytes()
+        picture = cv2.imencode(suffix, numbered(len(fetched), 640))[1].tobytes()
         request.send_response(200)
         if states_length:  # as most cameras do
             request.send_header("Content-Length", str(len(picture)))
@@ -291,14 +252,9 @@ def test_a_still_picture_is_fetched_again_and_again(served, caplog, suffix, stat
     assert not caplog.records
 
 
-def test_hls_is_returned_at_the_pace_of_its_pictures_and_none_twice(tmp_path, served, monkeypatch, caplog):
-    options = {"hls_time": "1", "hls_list_size": "0", "hls_flags": "omit_endlist"}
-    with av.open(str(tmp_path / "live.m3u8"), "w", format="hls", options=options) as container:
-        stream = container.add_stream("libx264", rate=25, options={"g": "25", "tune": "zerolatency"})
-        stream.width, stream.height = 128, 96
-        for number in range(75):
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(numbered(number), format="bgr24")))
-        container.mux(stream.encode(None))
+def test_hls_is_returned_at_its_pace_without_repetition(tmp_path, served, monkeypatch, caplog):
+    options = {"hls_time": "1", "hls_list_size": "0", "hls_flags": "omit_endlist", "v:g": "25", "v:tune": "zerolatency"}
+    write_video(tmp_path / "live.m3u8", 75, (*options.items(),))
     monkeypatch.setattr(connection, "LONGEST_SEGMENT", 0.2)
     url, is_over = f"{served(tmp_path)}/live.m3u8", lambda: source.counters.get("lost_seconds", 0) > 2
     with open_source(url, idle=is_over, read_timeout_seconds=0.3) as source:  # it reconnects after its last segment
@@ -324,7 +280,7 @@ ADDRESSES = [
 
 
 @pytest.mark.parametrize("address", ADDRESSES)
-def test_no_message_and_no_name_contains_a_password(address):
+def test_messages_and_names_contain_no_password(address):
     with pytest.raises(VideoError) as error:
         open_source(address)
     assert "SeCrEt" not in f"{error.value} {without_password(address)} {live._name(address)}"

@@ -1,4 +1,4 @@
-"""The demo as a live source: it begins with its first image, never ends, and skips what is not read in time."""
+"""The demo as a live source: it never ends, and skips frames that are read late."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def read(source, clock, seconds):
     return next(source)
 
 
-def test_live_demo_begins_with_its_first_image_whenever_it_is_read(clock):
+def test_live_demo_begins_with_its_first_image(clock):
     with open_source("demo:1") as source:
         clock.now += 3600
         first = next(source)
@@ -36,7 +36,7 @@ def test_live_demo_begins_with_its_first_image_whenever_it_is_read(clock):
     assert np.array_equal(first.image, image)
 
 
-def test_frames_that_are_not_read_in_time_are_skipped_and_counted(clock):
+def test_late_frames_are_skipped_and_counted(clock):
     with open_source("demo:1") as source:
         frames = [next(source), read(source, clock, 0.041), read(source, clock, 0.2)]
         assert [frame.number for frame in frames] == [0, 1, 2]
@@ -54,7 +54,7 @@ def test_live_demo_runs_forwards_and_backwards_without_end(clock):
         assert len(source._images) == 1, "an image that is never shown is not rendered"
 
 
-def test_a_later_start_continues_with_the_image_of_that_number(clock):
+def test_later_start_continues_with_the_image_of_its_number(clock):
     with open_source("demo:1") as whole, open_source("demo:1", start=3, since=90.0) as later:
         frame = next(later)
         assert (frame.number, frame.time, frame.pts) == (3, 10.0, 3 / 25)
@@ -63,7 +63,7 @@ def test_a_later_start_continues_with_the_image_of_that_number(clock):
         assert np.array_equal(frame.image, read(whole, clock, 0.121).image)
 
 
-def test_idle_function_ends_iteration_and_a_closed_source_ends(clock):
+def test_idle_function_or_close_ends_iteration(clock):
     with open_source("demo:1", idle=lambda: True, image_rate=1.0) as source:
         next(source)
         assert next(source, None) is None
@@ -72,6 +72,6 @@ def test_idle_function_ends_iteration_and_a_closed_source_ends(clock):
 
 
 @pytest.mark.parametrize("text", ["demo:", "demo:x", "demo:-1", "demo:1?rate=10"])
-def test_a_text_that_names_no_live_demo_is_an_error_that_shows_one(text):
+def test_invalid_live_demo_is_an_error_with_an_example(text):
     with pytest.raises(VideoError, match="is not a live demo: expected demo:SEED, for example demo:1"):
         open_source(text)

@@ -1,4 +1,4 @@
-"""Containers, codecs, frame rates, sound and joins: all frames and their times, as Debian's FFmpeg says."""
+"""Containers, codecs, frame rates, sound and joins: all frames and their times equal those of Debian's FFmpeg."""
 
 from __future__ import annotations
 
@@ -8,18 +8,18 @@ import shutil
 import subprocess
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from catstream.video.source import open_source
 from catstream.video.video_frames import VideoFrames
+from tests.video.pictures import number_of, numbered
 
 pytestmark = [
     pytest.mark.system,
     pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="no ffmpeg to compare with: apt-get install ffmpeg"),
 ]
 
-FRAMES, RATE, SIZE = 24, 25, (160, 120)
+FRAMES, RATE = 24, 25
 _B_FRAMES = "-bf 2 -g 8"
 #: Options of the encoder of each codec.
 CODECS = {
@@ -72,19 +72,10 @@ IRREGULAR = "(N+floor(N/3)+2*floor(N/7))"
 
 @pytest.fixture(scope="session")
 def pictures(tmp_path_factory):
-    """Uncompressed frames that show their number as five black and white fields."""
-    path, rng = tmp_path_factory.mktemp("pictures") / "numbered.bgr", np.random.default_rng(0)
-    scene = rng.integers(60, 190, (SIZE[1] // 8, SIZE[0] // 8, 3), np.uint8).repeat(8, 0).repeat(8, 1)
-    images = np.repeat(scene[None], FRAMES, 0)
-    for number in range(FRAMES):
-        for bit in range(5):
-            images[number, 8:32, 32 * bit : 32 * bit + 32] = 255 * (number >> bit & 1)
-    path.write_bytes(images.tobytes())
+    """Uncompressed frames that show their number."""
+    path = tmp_path_factory.mktemp("pictures") / "numbered.bgr"
+    path.write_bytes(b"".join(numbered(number).tobytes() for number in range(FRAMES)))
     return path
-
-
-def number_of(image: np.ndarray) -> int:
-    return sum((int(image[16:24, 32 * bit + 8 : 32 * bit + 24].mean() > 127) << bit) for bit in range(5))
 
 
 def ffmpeg(*words: object) -> None:
@@ -107,12 +98,12 @@ def make(path: Path, pictures: Path, codec: str, *, times: str, sound: bool = Fa
     return path
 
 
-def said(path: Path) -> list[float | None]:
-    """The times of the frames that FFmpeg's own tool says; None where it says none."""
+def reference_times(path: Path) -> list[float | None]:
+    """The times of the frames according to ffprobe, None where it has none."""
     command = ["ffprobe", "-v", "quiet", "-select_streams", "V:0", "-show_entries", "frame=best_effort_timestamp_time"]
     answer = json.loads(subprocess.run([*command, "-of", "json", path], check=True, capture_output=True).stdout)
     times = [frame.get("best_effort_timestamp_time") for frame in answer["frames"]]
-    return [None if time is None or path.suffix[1:] in RAW else float(time) for time in times]
+    return [None if time is None else float(time) for time in times]
 
 
 def read(path: Path) -> tuple[list[int], list[float]]:
@@ -123,7 +114,7 @@ def read(path: Path) -> tuple[list[int], list[float]]:
     return [number_of(frame.image) for frame in frames], [frame.time for frame in frames]
 
 
-def compared(times: list[float], wanted: list[float | None]) -> None:
+def assert_close(times: list[float], wanted: list[float | None]) -> None:
     """Compare times from the first frame that has one on."""
     assert len(times) == len(wanted)
     known = [(time, other) for time, other in zip(times, wanted, strict=True) if other is not None]
@@ -131,21 +122,20 @@ def compared(times: list[float], wanted: list[float | None]) -> None:
 
 
 @pytest.mark.parametrize(("container", "codec"), FORMATS, ids=str)
-def test_all_frames_and_their_times_are_those_that_ffmpeg_says(tmp_path, pictures, container, codec):
+def test_frames_and_times_equal_those_of_ffmpeg(tmp_path, pictures, container, codec):
     constant = make(tmp_path / f"constant.{container}", pictures, codec, times="N")
     variants = [(constant, range(FRAMES))]
     if container not in RAW:
         variable = tmp_path / f"variable.{container}"
         variants.append((make(variable, pictures, codec, times=IRREGULAR, sound=True), range(FRAMES)))
         cut = tmp_path / f"cut.{container}"
-        if (
-            container != "ogv" and codec != "AV1"
-        ):  # of which Debian's FFmpeg says wrong times, and frames before the cut
+        # Debian's FFmpeg has wrong times of these two, and frames before the cut.
+        if container != "ogv" and codec != "AV1":
             ffmpeg("-ss", 0.48, "-i", constant, "-c", "copy", cut)
             variants.append((cut, None))
     for path, wanted in variants:
         numbers, times = read(path)
-        compared(times, said(path) if container not in RAW else [number / RATE for number in range(FRAMES)])
+        assert_close(times, [n / RATE for n in range(FRAMES)] if container in RAW else reference_times(path))
         assert numbers == list(wanted or range(numbers[0], numbers[0] + len(times))), path.name
         frames = VideoFrames(path)
         frames.scan()
@@ -153,7 +143,7 @@ def test_all_frames_and_their_times_are_those_that_ffmpeg_says(tmp_path, picture
         assert [number_of(frames[number]) for number in reversed(range(len(frames)))] == numbers[::-1]
 
 
-def test_the_table_of_the_how_to_lists_what_is_compared():
+def test_how_to_lists_the_compared_formats():
     page = Path(__file__).parents[2] / "docs" / "how-to" / "sources.md"
     rows = dict(re.findall(r"^\.(\w+) +(.+)$", page.read_text(), re.MULTILINE))
     assert rows == {container: codecs.replace(" ", ", ") for container, (codecs, _) in CONTAINERS.items()}

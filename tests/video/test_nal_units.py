@@ -39,18 +39,18 @@ def taken(units, *parts):
     return [[bytes(whole) for whole in units.take(packet(part))] for part in parts]
 
 
-def test_a_unit_is_whole_with_the_fragment_that_is_shorter():
+def test_shorter_fragment_ends_a_unit():
     units, one = NalUnits(), unit(250)
     assert taken(units, *fragments(one)) == [[], [], [one]]
     assert taken(units, unit(40)) == [[unit(40)]]
 
 
-def test_a_unit_whose_fragments_all_have_one_length_is_whole_when_the_next_begins():
+def test_next_unit_ends_one_with_fragments_of_equal_length():
     units, one, other = NalUnits(), unit(200), unit(150)
     assert taken(units, *fragments(one), *fragments(other)) == [[], [], [one], [other]]
 
 
-def test_a_unit_that_continues_after_a_shorter_fragment_is_an_error():
+def test_fragment_after_a_shorter_one_is_an_error():
     units = NalUnits()
     taken(units, *fragments(unit(250)))
     with pytest.raises(ValueError, match="shorter"):
@@ -64,7 +64,7 @@ def test_second_slice_of_a_frame_is_an_error():
         taken(units, START + b"\1" + b"\x55" * 40, unit(40))
 
 
-def test_a_unit_has_the_time_of_its_first_fragment_and_says_whether_it_is_key():
+def test_unit_has_the_time_and_type_of_its_first_fragment():
     units, found = NalUnits(), []
     for pts, kind in enumerate((7, 8, 5, 1)):
         for part in fragments(unit(200, kind)):
@@ -72,8 +72,8 @@ def test_a_unit_has_the_time_of_its_first_fragment_and_says_whether_it_is_key():
     assert [(whole.pts, whole.is_keyframe) for whole in found] == [(0, True), (1, True), (2, True)]
 
 
-class _Patient(Broadcast):
-    """Sends a frame when the one before was received."""
+class _Acknowledged(Broadcast):
+    """Sends each frame after the previous one was received."""
 
     def __init__(self, *args, **options):
         super().__init__(*args, **options)
@@ -93,10 +93,10 @@ def access_units(rng):
     return [bytes(packet) for image in noise for packet in encoder.packets(image)]
 
 
-def test_no_frame_over_rtsp_waits_for_the_next_one(access_units):
+def test_rtsp_frame_does_not_wait_for_the_next(access_units):
     assert min(map(len, access_units)) > 1400
     with (
-        _Patient("h264", (240, 160), access_units) as camera,
+        _Acknowledged("h264", (240, 160), access_units) as camera,
         open_source(*camera.urls, read_timeout_seconds=15) as source,
     ):
         seen = []
@@ -108,7 +108,7 @@ def test_no_frame_over_rtsp_waits_for_the_next_one(access_units):
     assert seen == [*range(len(access_units))]
 
 
-def test_a_camera_whose_fragments_have_several_lengths_is_read_with_the_parser(access_units, monkeypatch):
+def test_fragments_of_several_lengths_are_read_with_the_parser(access_units, monkeypatch):
     monkeypatch.setattr(rtsp, "payloads", shrinking)
     with Broadcast("h264", (240, 160), access_units) as camera, open_source(*camera.urls) as source:
         assert next(source).image.shape == (160, 240, 3)
@@ -126,7 +126,7 @@ class _Freezing(Broadcast):
         self._closed.wait()
 
 
-def test_rtsp_camera_that_freezes_is_reconnected(access_units, caplog):
+def test_frozen_rtsp_camera_is_reconnected(access_units, caplog):
     with (
         _Freezing("h264", (240, 160), access_units) as camera,
         open_source(*camera.urls, read_timeout_seconds=0.5) as source,

@@ -60,11 +60,11 @@ def test_next_attempt_follows_from_the_losses(protocol, losses, expected):
 
 
 @pytest.mark.parametrize("losses", [losses for losses, _ in HTTP.values()], ids=HTTP)
-def test_only_http_is_polled_or_read_as_jpegs(losses):
+def test_other_protocols_are_neither_polled_nor_read_as_jpegs(losses):
     assert {(attempt.begin, attempt.mode) for attempt in attempts(losses, "rtmp")} == {("backoff", "parsed")}
 
 
-def test_the_backoff_doubles_up_to_a_limit_until_a_frame_arrives():
+def test_backoff_doubles_up_to_a_limit_until_a_frame():
     refused = [("failed", 0)]
     assert [attempt.backoff for attempt in attempts(7 * refused)] == [0.25, 0.5, 1, 2, 4, 8, 8]
     assert [attempt.backoff for attempt in attempts([*refused, *refused, ("ended", 9), *refused])][2:] == [0.25, 0.5]
@@ -73,6 +73,5 @@ def test_the_backoff_doubles_up_to_a_limit_until_a_frame_arrives():
 
 @pytest.mark.parametrize("kind", get_args(Kind))
 @pytest.mark.parametrize("frames", [0, 1, 90])
-def test_reconnection_pauses_after_at_most_one_immediate_attempt(kind, frames):
-    """A source that cannot be read is not asked again and again without a pause."""
+def test_at_most_one_attempt_is_made_at_once(kind, frames):
     assert "at once" not in {attempt.begin for attempt in attempts([("invalid", 0), (kind, frames)])[1:]}

@@ -6,10 +6,8 @@ import gc
 import io
 import os
 import struct
-import tempfile
 from collections.abc import Callable
 from fractions import Fraction
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -22,120 +20,40 @@ from av.stream import Disposition
 from catstream.errors import VideoError
 from catstream.video.frames import Source, UprightConverter
 from catstream.video.source import open_source
-
-H264 = dict.fromkeys((".mp4", ".mkv", ".ts", ".mov", ".h264", ".flv", ".MTS"), "libx264")
-CODECS = {**H264, ".avi": "mjpeg", ".mpg": "mpeg2video", ".wmv": "wmv2"}
-
-
-@cache
-def numbered(number: int, width: int = 160, height: int = 120) -> np.ndarray:
-    """Seven bits of the number as black and white fields, which survive lossy coding, over noise of its own."""
-    image = np.random.default_rng(number).integers(60, 190, (height, width, 3), np.uint8)
-    for bit in range(7):
-        image[4:20, 4 + 20 * bit : 20 + 20 * bit] = 255 if number >> bit & 1 else 0
-    return image
-
-
-def number_of(image: np.ndarray) -> int:
-    """The number that `numbered` wrote."""
-    return sum((int(image[8:16, 8 + 20 * bit : 16 + 20 * bit].mean() > 127) << bit) for bit in range(7))
-
-
-@cache
-def encoded(
-    suffix: str,
-    frames: int = 100,
-    options: tuple[tuple[str, str], ...] = (),
-    rotation: int = 0,
-    times: tuple[float, ...] = (),
-    sound: float = 0.0,
-    title: str = "",
-) -> bytes:
-    """A file of numbered frames, which many tests read.
-
-    options  of the container, and with the prefix v: of the codec
-    times    time stamps of the frames in seconds; empty for 25 frames per second
-    sound    seconds of a sound track
-    """
-    with tempfile.TemporaryDirectory() as folder:
-        path, codec = Path(folder, f"a{suffix}"), CODECS[suffix]
-        # The same bytes in each run: Matroska has random identifiers, x264's macroblock tree is chaotic.
-        muxing = {"fflags": "bitexact", "cluster_time_limit": "400"}  # a long Matroska has many clusters
-        coding = {"preset": "superfast"} if codec == "libx264" else {}
-        for key, value in options:
-            (coding if key.startswith("v:") else muxing)[key.removeprefix("v:")] = value
-        with av.open(str(path), "w", options=muxing) as container:
-            container.metadata["title"] = title
-            stream: Any = container.add_stream(codec, rate=25, options=coding)
-            stream.width, stream.height = 160, 120
-            stream.codec_context.thread_count = 3  # the bytes depend on it
-            stream.pix_fmt = "yuvj420p" if codec == "mjpeg" else "yuv420p"
-            tone: Any = container.add_stream("aac", rate=16000, layout="mono") if sound else None
-            if rotation:
-                stream.set_display_rotation(rotation)
-            for number in range(frames):
-                frame = av.VideoFrame.from_ndarray(numbered(number), format="bgr24")
-                if times:
-                    frame.pts, frame.time_base = round(1000 * times[number]), Fraction(1, 1000)
-                    stream.codec_context.time_base = frame.time_base
-                container.mux(stream.encode(frame))
-            container.mux(stream.encode(None))
-            if sound:
-                samples = av.AudioFrame.from_ndarray(np.zeros((1, round(16000 * sound)), np.float32), "fltp", "mono")
-                samples.sample_rate = 16000
-                container.mux([*tone.encode(samples), *tone.encode(None)])
-        return path.read_bytes()
-
-
-@pytest.fixture
-def video(tmp_path: Path) -> Callable[..., Path]:
-    """Writes a video of numbered frames; the ending of its name says which kind."""
-
-    def write(name: str, frames: int = 100, options: dict[str, str] | None = None, **others: Any) -> Path:
-        path = tmp_path / name
-        codec = CODECS[path.suffix]
-        if codec not in av.codecs_available:
-            pytest.skip(f"this FFmpeg cannot write {codec}")
-        path.write_bytes(encoded(path.suffix, frames, tuple((options or {}).items()), **others))
-        return path
-
-    return write
-
-
-def damaged(path: Path, share: float) -> Path:
-    """The video with a twentieth of its bytes overwritten, from a share of it on."""
-    data = bytearray(path.read_bytes())
-    start, count = int(share * len(data)), len(data) // 20
-    data[start : start + count] = np.random.default_rng(0).integers(0, 256, count, np.uint8).tobytes()
-    path.write_bytes(data)
-    return path
-
-
-@pytest.fixture
-def images(tmp_path: Path) -> Callable[..., Path]:
-    """Writes numbered images into a folder: by name in the order given, or so many, 0.png and so on."""
-
-    def write(folder: str, names: list[str] | int) -> Path:
-        path = tmp_path / folder
-        for number, name in enumerate([f"{k}.png" for k in range(names)] if isinstance(names, int) else names):
-            (path / name).parent.mkdir(parents=True, exist_ok=True)
-            (path / name).write_bytes(cv2.imencode(Path(name).suffix, numbered(number))[1].tobytes())
-        return path
-
-    return write
-
+from tests.video import pictures
+from tests.video.pictures import damaged, make_video, number_of, numbered
 
 KINDS = pytest.mark.parametrize("name", ["a.mp4", "a.mkv", "a.ts", "a.avi", "a.mpg"])
+PARTS = [slice(7, 31, 3), slice(90, None), slice(None, 200, 11)]
 
 
-def numbers(source: Source) -> list[int]:
+def make_images(folder: Path, names: list[str]) -> Path:
+    """Write numbered images into a folder, by name in the order given."""
+    for number, name in enumerate(names):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_bytes(cv2.imencode(Path(name).suffix, numbered(number))[1].tobytes())
+    return folder
+
+
+@pytest.fixture
+def five(tmp_path: Path) -> Path:
+    """A folder of five images."""
+    return make_images(tmp_path / "walk", [f"{number}.png" for number in range(5)])
+
+
+def read(source: Source) -> list[tuple[int, float, int]]:
+    """The number and the time of each frame, and the number that it shows."""
     with source:
-        return [number_of(frame.image) for frame in source]
+        return [(frame.number, frame.time, number_of(frame.image)) for frame in source]
 
 
-def broken(path, start: int = 0) -> tuple[list[int], str]:
+def shown(source: Source) -> list[int]:
+    return [number for *_, number in read(source)]
+
+
+def broken(path: Path) -> tuple[list[int], str]:
     """Numbers of the good frames of a broken source, and the error after them."""
-    source, good = open_source(path, start), []
+    source, good = open_source(path), []
     try:
         for frame in source:
             good.append(number_of(frame.image))
@@ -148,54 +66,47 @@ def broken(path, start: int = 0) -> tuple[list[int], str]:
 
 
 @KINDS
-def test_every_frame_of_a_video_is_returned_once_in_order_with_its_number_and_time(video, name):
-    path = video(name)
+def test_video_has_every_frame_once_in_order(tmp_path, name):
+    path = make_video(tmp_path / name)
     with open_source(path) as source:
         assert (source.name, source.size, source.rate, source.live) == ("a", (160, 120), 25.0, False)
         assert source.frames == 100
-        found = [(frame.number, frame.time, number_of(frame.image)) for frame in source]
-    assert found == [(number, pytest.approx(number / 25, abs=0.002), number) for number in range(100)]
-    with open_source(path, start=37) as source:
-        assert [(frame.number, frame.time, number_of(frame.image)) for frame in source] == found[37:]
-
-
-PARTS = [slice(7, 31, 3), slice(90, None), slice(None, 200, 11)]
+        frames = read(source)
+    assert frames == [(number, pytest.approx(number / 25, abs=0.002), number) for number in range(100)]
+    assert read(open_source(path, start=37)) == frames[37:]
 
 
 @pytest.mark.parametrize("part", PARTS, ids=str)
 @pytest.mark.parametrize("name", ["a.mp4", "a.mpg"])
-def test_frames_of_a_part_keep_their_time_stamps(video, name, part):
+def test_frames_of_a_part_keep_their_time_stamps(tmp_path, name, part):
     wanted = range(100)[part]
-    with open_source(video(name), part=part) as source:
-        assert source.frames in (len(wanted), None)
-        assert source.rate == 25 / wanted.step
-        frames = list(source)
-    assert [number_of(frame.image) for frame in frames] == list(wanted)
-    assert [frame.number for frame in frames] == list(range(len(wanted)))
-    assert [frame.time for frame in frames] == pytest.approx([number / 25 for number in wanted], abs=0.002)
+    source = open_source(make_video(tmp_path / name), part=part)
+    assert source.frames in (len(wanted), None)
+    assert source.rate == 25 / wanted.step
+    expected = [(place, pytest.approx(number / 25, abs=0.002), number) for place, number in enumerate(wanted)]
+    assert read(source) == expected
 
 
-def test_damage_after_a_part_is_no_error(video):
-    path = damaged(video("a.mpg"), 0.5)
+def test_damage_after_a_part_is_no_error(tmp_path):
+    path = damaged(make_video(tmp_path / "a.mpg"), 0.5)
     good, _ = broken(path)
-    assert numbers(open_source(path, part=slice(5, len(good)))) == good[5:]
+    assert shown(open_source(path, part=slice(5, len(good)))) == good[5:]
 
 
 @KINDS
 @pytest.mark.parametrize("share", [0.31, 0.6, 0.83])
-def test_a_truncated_video_returns_its_good_frames_in_order(video, name, share):
-    path = video(name, options={"movflags": "faststart"} if name.endswith("mp4") else None)
-    whole = path.read_bytes()
-    path.write_bytes(whole[: int(len(whole) * share)])
-    found = numbers(open_source(path, skip_damaged=True))
-    assert found == sorted(set(found))
-    assert found[:3] == [0, 1, 2]
-    assert found[-1] < 99
+def test_truncated_video_has_its_good_frames_in_order(tmp_path, name, share):
+    path = make_video(tmp_path / name, options={"movflags": "faststart"} if name.endswith("mp4") else None)
+    os.truncate(path, int(path.stat().st_size * share))
+    numbers = shown(open_source(path, skip_damaged=True))
+    assert numbers == sorted(set(numbers))
+    assert numbers[:3] == [0, 1, 2]
+    assert numbers[-1] < 99
 
 
 @pytest.mark.parametrize("name", ["a.mp4", "a.mpg"])
-def test_what_ffmpeg_cannot_decode_is_an_error_after_the_frames_before_it(video, name):
-    path = damaged(video(name), 0.5)
+def test_damage_is_an_error_after_the_frames_before_it(tmp_path, name):
+    path = damaged(make_video(tmp_path / name), 0.5)
     good, message = broken(path)
     assert good == list(range(len(good)))
     assert 20 < len(good) < 80
@@ -205,23 +116,22 @@ def test_what_ffmpeg_cannot_decode_is_an_error_after_the_frames_before_it(video,
 
 @pytest.mark.parametrize("name", ["a.mp4", "a.mkv", "a.avi", "a.mpg"])
 @pytest.mark.parametrize("share", [0.3, 0.7])
-def test_skip_damaged_continues_at_the_next_keyframe_and_frames_keep_their_times(video, name, share):
-    path = damaged(video(name, options={"v:g": "10"}), share)
-    with open_source(path, skip_damaged=True) as source:
-        found = [(frame.number, frame.time, number_of(frame.image)) for frame in source]
-        lost = source.counters.get("damaged", 0)
-    shown = [number for _, _, number in found]
-    assert [number for number, _, _ in found] == list(range(len(found)))
-    assert shown == sorted(set(shown))
-    assert (shown[0], shown[-1]) == (0, 99)
-    assert lost <= 100 - len(shown) + 1 < 40  # a container may pass over a damaged place without a word
+def test_skip_damaged_continues_at_the_next_keyframe(tmp_path, name, share):
+    path = damaged(make_video(tmp_path / name, options={"v:g": "10"}), share)
+    source = open_source(path, skip_damaged=True)
+    frames = read(source)
+    numbers, times, seen = zip(*frames, strict=True)
+    assert list(numbers) == list(range(len(frames)))
+    assert list(seen) == sorted(set(seen))
+    assert (seen[0], seen[-1]) == (0, 99)
+    # A container may pass over a damaged place without a word.
+    assert source.counters.get("damaged", 0) <= 100 - len(seen) + 1 < 40
     if path.suffix != ".avi":  # which counts frames in the place of times
-        assert [time for _, time, _ in found] == pytest.approx([number / 25 for number in shown], abs=0.002)
-    with open_source(path, 20, skip_damaged=True) as source:
-        assert [(frame.number, frame.time, number_of(frame.image)) for frame in source] == found[20:]
+        assert times == pytest.approx([number / 25 for number in seen], abs=0.002)
+    assert read(open_source(path, 20, skip_damaged=True)) == frames[20:]
 
 
-#: Whole files that something is unusual about: the name, and what `video` is given for it.
+#: Whole files with an unusual property: their name, and how they are made.
 LATE = tuple(5 + number / 25 for number in range(60))
 WHOLE: dict[str, tuple[str, dict[str, Any]]] = {
     "sound outlasts the picture": ("a.mp4", {"sound": 9.0}),
@@ -235,67 +145,56 @@ WHOLE: dict[str, tuple[str, dict[str, Any]]] = {
 
 
 @pytest.mark.parametrize(("name", "others"), WHOLE.values(), ids=WHOLE)
-def test_a_whole_file_is_read_to_its_last_frame_and_its_times_grow(video, name, others, monkeypatch):
+def test_unusual_file_is_read_to_its_last_frame(tmp_path, name, others, monkeypatch):
     if name == "b.avi":
-        monkeypatch.setitem(CODECS, ".avi", "libx264")
-    path = video(name, 60, **others)
+        monkeypatch.setitem(pictures.CODECS, ".avi", "libx264")
+    path = make_video(tmp_path / name, 60, **others)
     path.write_bytes(path.read_bytes().replace(b"XXXXXXXX", "обработ".encode("cp1251") + b"!"))
+    first, *_ = times = others.get("times", LATE)
     for skip in (False, True):
-        with open_source(path, skip_damaged=skip) as source:
-            frames = list(source)
-            assert not source.counters
-            assert source.frames == 60
-        assert [number_of(frame.image) for frame in frames] == list(range(60))
-        wanted = np.subtract(others.get("times", LATE), others.get("times", LATE)[0])
-        assert [frame.time for frame in frames] == pytest.approx(wanted, abs=0.002)
+        source = open_source(path, skip_damaged=skip)
+        assert source.frames == 60
+        expected = [(number, pytest.approx(time - first, abs=0.002), number) for number, time in enumerate(times)]
+        assert read(source) == expected
+        assert not source.counters
 
 
-def test_the_seconds_that_a_truncated_matroska_file_lacks_are_counted(video):
-    path = video("a.mkv", 100, sound=4.0)
-    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-    for part, lacks in ((slice(None), True), (slice(0, 5), False)):
-        with open_source(path, part=part) as source:
-            last = [frame.time for frame in source][-1]
-            assert source.counters.get("truncated", 0) == (round(4 - last) if lacks else 0)
+def test_missing_seconds_of_a_truncated_matroska_are_counted(tmp_path):
+    path = make_video(tmp_path / "a.mkv", sound=4.0)
+    os.truncate(path, path.stat().st_size // 2)
+    for part, is_truncated in ((slice(None), True), (slice(0, 5), False)):
+        source = open_source(path, part=part)
+        _, last, _ = read(source)[-1]
+        assert source.counters.get("truncated", 0) == (round(4 - last) if is_truncated else 0)
 
 
 @pytest.mark.parametrize("name", ["joined.ts", "list.m3u8"])
-def test_joined_segments_are_read_to_the_end_and_time_goes_on(video, tmp_path, name):
-    part = video("part.ts", 30, options={"v:bf": "2"})
+def test_joined_segments_are_read_to_the_end(tmp_path, name):
+    part = make_video(tmp_path / "part.ts", 30, {"v:bf": "2"})
     (tmp_path / "joined.ts").write_bytes(3 * part.read_bytes())
     (tmp_path / "list.m3u8").write_text(
         "#EXTM3U\n#EXT-X-VERSION:3\n#EXT-X-TARGETDURATION:2\n"
         + "#EXT-X-DISCONTINUITY\n".join(3 * ["#EXTINF:1.2,\npart.ts\n"])
         + "#EXT-X-ENDLIST\n"
     )
-    with open_source(tmp_path / name) as source:
-        found = [(number_of(frame.image), frame.time) for frame in source]
-    assert [number for number, _ in found] == 3 * list(range(30))
-    assert [time for _, time in found] == pytest.approx([number / 25 for number in range(90)], abs=0.002)
+    expected = [(number, pytest.approx(number / 25, abs=0.002), number % 30) for number in range(90)]
+    assert read(open_source(tmp_path / name)) == expected
 
 
-def test_a_stream_without_a_container_has_the_rate_that_it_states(video):
-    path = video("a.h264", 20, options={"v:x264-params": "fps=50/1:force-cfr=1"})
+def test_raw_h264_has_the_rate_of_its_header(tmp_path):
+    path = make_video(tmp_path / "a.h264", 20, {"v:x264-params": "fps=50/1:force-cfr=1"})
     with open_source(path) as source:
         assert source.rate == pytest.approx(50)
         assert [frame.time for frame in source] == pytest.approx([number / 50 for number in range(20)])
 
 
-def test_a_video_that_changes_its_size_ends_there_or_is_scaled(video, tmp_path):
-    large = tmp_path / "large.ts"
-    with av.open(str(large), "w") as container:
-        stream: Any = container.add_stream("libx264", rate=25)
-        stream.width, stream.height, stream.pix_fmt = 320, 240, "yuv420p"
-        for number in range(30, 40):
-            image = cv2.resize(numbered(number), (320, 240))
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="bgr24")))
-        container.mux(stream.encode(None))
-    path = video("a.ts", 30)
+def test_changed_size_is_an_error_or_scaled(tmp_path):
+    path, large = make_video(tmp_path / "a.ts", 30), make_video(tmp_path / "large.ts", 10, size=(320, 240))
     path.write_bytes(path.read_bytes() + large.read_bytes())
     good, message = broken(path)
     assert (good, "(frame 30) is 320x240, the first 160x120" in message) == (list(range(30)), True)
     source = open_source(path, resize=True)
-    assert numbers(source) == list(range(40))
+    assert shown(source) == [*range(30), *range(10)]
     assert source.counters == {"scaled": 10}
 
 
@@ -304,7 +203,7 @@ def without_pictures(data: bytes) -> bytes:
     return data[:first] + bytes(last - first) + data[last:]
 
 
-#: What becomes of a file of 5 frames, how it is opened, and the error.
+#: A change to a file of 5 frames, how it is opened, and the error.
 UNUSABLE: dict[str, tuple[Callable[[bytes], bytes], dict[str, Any], str]] = {
     "without an index": (lambda data: data[: data.index(b"moov")], {}, "not a video that can be read"),
     "without pictures": (without_pictures, {"skip_damaged": True}, "no frame of a can be decoded"),
@@ -314,14 +213,24 @@ UNUSABLE: dict[str, tuple[Callable[[bytes], bytes], dict[str, Any], str]] = {
 
 
 @pytest.mark.parametrize(("changed", "options", "message"), UNUSABLE.values(), ids=UNUSABLE)
-def test_a_video_that_cannot_be_used_is_an_error_with_its_reason(video, changed, options, message):
-    path = video("a.mp4", frames=5)
+def test_unusable_video_is_an_error_with_its_reason(tmp_path, changed, options, message):
+    path = make_video(tmp_path / "a.mp4", 5)
     path.write_bytes(changed(path.read_bytes()))
     with pytest.raises(VideoError, match=message):
         open_source(path, **options)
 
 
-#: Directions on the screen of the axes of the stored picture, and what is seen of an array.
+def test_frame_is_freed_without_garbage_collection(tmp_path):
+    with av.open(str(make_video(tmp_path / "a.mp4", 1))) as container:
+        decoded = next(container.decode(video=0))
+    upright = UprightConverter()
+    gc.collect()
+    upright(decoded)
+    del decoded
+    assert gc.collect() == 0
+
+
+#: Directions on the screen of the axes of the stored picture, and the view of an array.
 DISPLAYED: dict[str, tuple[tuple[int, ...], Callable[[np.ndarray], np.ndarray]]] = {
     "turned left": ((0, -1, 1, 0), np.rot90),
     "turned right": ((0, 1, -1, 0), lambda stored: np.rot90(stored, -1)),
@@ -333,19 +242,9 @@ DISPLAYED: dict[str, tuple[tuple[int, ...], Callable[[np.ndarray], np.ndarray]]]
 }
 
 
-def test_a_frame_is_freed_without_a_garbage_collection(video):
-    with av.open(str(video("a.mp4", frames=1))) as container:
-        decoded = next(container.decode(video=0))
-    upright = UprightConverter()
-    gc.collect()
-    upright(decoded)
-    del decoded
-    assert gc.collect() == 0
-
-
-@pytest.mark.parametrize(("matrix", "seen"), DISPLAYED.values(), ids=DISPLAYED)
-def test_videos_are_turned_and_mirrored_as_their_display_matrix_says(video, matrix, seen):
-    path = video("a.mp4", frames=1)
+@pytest.mark.parametrize(("matrix", "view"), DISPLAYED.values(), ids=DISPLAYED)
+def test_display_matrix_turns_and_mirrors_frames(tmp_path, matrix, view):
+    path = make_video(tmp_path / "a.mp4", 1)
     with open_source(path) as source:
         stored = next(source).image
     data, (a, b, c, d) = path.read_bytes(), (65536 * each for each in matrix)
@@ -353,12 +252,12 @@ def test_videos_are_turned_and_mirrored_as_their_display_matrix_says(video, matr
     path.write_bytes(data[:place] + struct.pack(">9i", a, b, 0, c, d, 0, 0, 0, 1 << 30) + data[place + 36 :])
     with open_source(path) as source:
         image = next(source).image
-    np.testing.assert_array_equal(image, seen(stored))
+    np.testing.assert_array_equal(image, view(stored))
     assert image.flags.c_contiguous
     assert source.size == image.shape[1::-1]
 
 
-def test_a_jpeg_picture_with_exif_data_is_read():
+def test_jpeg_with_exif_data_is_read():
     image = np.full((48, 64, 3), 90, np.uint8)
     jpeg = cv2.imencode(".jpg", image)[1].tobytes()
     exif = b"Exif\0\0MM\0*\0\0\0\x08\0\x01\x01\x0f\0\x02\0\0\0\x04cam\0\0\0\0\0"  # the maker is "cam"
@@ -368,32 +267,44 @@ def test_a_jpeg_picture_with_exif_data_is_read():
     assert np.abs(UprightConverter()(frame).astype(int) - image).max() <= 2
 
 
-def test_the_aspect_of_pixels_is_that_of_the_frame_as_it_is_turned(tmp_path):
-    for rotation in (0, 90):
-        with av.open(str(tmp_path / "a.mp4"), "w") as container:
-            stream: Any = container.add_stream("mpeg4", rate=25)
-            stream.width, stream.height, stream.pix_fmt = 160, 120, "yuv420p"
-            stream.codec_context.sample_aspect_ratio = Fraction(4, 3)
-            stream.set_display_rotation(rotation)
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(numbered(0), format="bgr24")))
-            container.mux(stream.encode(None))
-        with open_source(tmp_path / "a.mp4") as source:
-            assert source.pixel_aspect == (Fraction(3, 4) if rotation else Fraction(4, 3))
+@pytest.mark.parametrize(("rotation", "aspect"), [(0, Fraction(4, 3)), (90, Fraction(3, 4))])
+def test_pixel_aspect_is_rotated_with_the_frame(tmp_path, rotation, aspect):
+    path = make_video(tmp_path / "a.mp4", 1, aspect=Fraction(4, 3), rotation=rotation)
+    with open_source(path) as source:
+        assert source.pixel_aspect == aspect
 
 
-def test_a_closed_source_has_no_frames(video):
-    source = open_source(video("a.avi", frames=5))
+def test_closed_source_has_no_frames(tmp_path):
+    source = open_source(make_video(tmp_path / "a.avi", 5))
     next(source)
     source.close()
     assert list(source) == []
     source.close()
 
 
+def test_cover_picture_is_not_the_video(tmp_path):
+    path = tmp_path / "a.mp4"
+    with av.open(str(path), "w") as container:
+        stream, cover = container.add_stream("mpeg4", rate=25), container.add_stream("mjpeg", rate=25)
+        cover.disposition = Disposition.attached_pic
+        stream.width, stream.height, stream.pix_fmt = 160, 120, "yuv420p"
+        cover.width, cover.height, cover.pix_fmt = 160, 120, "yuvj420p"
+        for each, number in ((stream, 7), (cover, 99)):
+            container.mux(each.encode(av.VideoFrame.from_ndarray(numbered(number), format="bgr24")))
+        container.mux([*stream.encode(None), *cover.encode(None)])
+    data = path.read_bytes()  # the cover is moved before the video
+    track, tags = data.index(b"trak") - 4, data.index(b"udta") - 4
+    path.write_bytes(data[:track] + data[tags:] + data[track:tags])
+    source = open_source(path)
+    assert source.frames == 1
+    assert shown(source) == [7]
+
+
 # --- images ------------------------------------------------------------------------------------------
 
 SEVEN = [f"{number:05d}.png" for number in range(7)]
 LATIN = os.fsdecode(b"caf\xe9")
-#: Names of images, what is opened, and the numbers of the images that are read.
+#: Names of images, the path to open, and the numbers of the images that are read.
 OPENED = {
     "in natural order": ([f"{number}.png" for number in range(12)], "walk", list(range(12))),
     **{pattern: (SEVEN, f"walk/{pattern}", list(range(7))) for pattern in ("%05d.png", "%d.png", "*.png", "000??.png")},
@@ -410,59 +321,54 @@ OPENED = {
 }
 
 
-@pytest.mark.parametrize(("names", "opened", "wanted"), OPENED.values(), ids=OPENED)
-def test_the_images_of_a_folder_or_a_pattern_are_read_in_order(images, names, opened, wanted):
-    folder = images("walk", names)
-    (folder / "note.txt").write_text("not an image")
-    with open_source(folder.parent / opened, image_rate=10.0) as source:
+@pytest.mark.parametrize(("names", "path", "wanted"), OPENED.values(), ids=OPENED)
+def test_images_of_a_folder_or_pattern_are_read_in_order(tmp_path, names, path, wanted):
+    (make_images(tmp_path / "walk", names) / "note.txt").write_text("not an image")
+    with open_source(tmp_path / path, image_rate=10.0) as source:
         assert (source.frames, source.size, source.rate) == (len(wanted), (160, 120), 10)
-        assert source.name == (LATIN if LATIN in opened else "walk")
-        frames = list(source)
+        assert source.name == (LATIN if LATIN in path else "walk")
+        assert read(source) == [(place, pytest.approx(place / 10), number) for place, number in enumerate(wanted)]
         assert list(source) == []
-    assert [number_of(frame.image) for frame in frames] == wanted
-    assert [frame.time for frame in frames] == pytest.approx([number / 10 for number in range(len(wanted))])
 
 
-def test_a_folder_opens_by_its_only_video(video, tmp_path):
-    path = video("a.MTS", frames=2)
+def test_folder_opens_by_its_only_video(tmp_path):
+    path = make_video(tmp_path / "a.MTS", 2)
     for name in ("._a.avi", "._cover.jpg", "groundtruth_rect.txt"):
         (tmp_path / name).write_bytes(b"no video")
-    assert numbers(open_source(tmp_path)) == numbers(open_source(path.as_uri())) == [0, 1]
-    video("b.avi", frames=1)
+    assert shown(open_source(tmp_path)) == shown(open_source(path.as_uri())) == [0, 1]
+    make_video(tmp_path / "b.avi", 1)
     with pytest.raises(VideoError, match="2 videos"):
         open_source(tmp_path)
 
 
 HUGE = bytes.fromhex("424d") + bytes(8) + struct.pack("<IIiiHHIIIIII", 54, 40, 40000, 40000, 1, 24, *(0,) * 6)
 UNREADABLE = {
-    "of another size": (
-        cv2.imencode(".png", numbered(3, width=150))[1].tobytes(),
-        ["150x120", "160x120", "run.resize=true"],
-    ),
-    "a text": (b"nothing", ["cannot read the image", "(frame 3): replace or remove it"]),
-    "empty": (b"", ["cannot read the image"]),
-    "a JPEG that is cut off": (cv2.imencode(".jpg", numbered(3))[1].tobytes()[:-500], ["cannot read the image"]),
-    "of more pixels than OpenCV reads": (HUGE, ["cannot read the image"]),
+    "of another size": (cv2.imencode(".png", numbered(3, 150))[1].tobytes(), "150x120, the first 160x120.*run.resize"),
+    "a text": (b"nothing", r"cannot read the image .*\(frame 3\): replace or remove it"),
+    "empty": (b"", "cannot read the image"),
+    "a JPEG that is cut off": (cv2.imencode(".jpg", numbered(3))[1].tobytes()[:-500], "cannot read the image"),
+    "of more pixels than OpenCV reads": (HUGE, "cannot read the image"),
 }
 
 
-@pytest.mark.parametrize(("content", "words"), UNREADABLE.values(), ids=UNREADABLE)
-def test_the_first_image_that_cannot_be_used_is_named(images, capfd, content, words):
-    folder = images("walk", 5)
-    (folder / "3.png").write_bytes(content)
-    good, message = broken(folder)
-    assert good == [0, 1, 2]
-    assert all(word in message for word in ["3.png", *words])
+@pytest.mark.parametrize(("content", "message"), UNREADABLE.values(), ids=UNREADABLE)
+def test_first_unusable_image_is_named_in_the_error(five, capfd, content, message):
+    (five / "3.png").write_bytes(content)
+    source = open_source(five)
+    assert [number_of(next(source).image) for _ in range(3)] == [0, 1, 2]
+    with pytest.raises(VideoError, match=message) as error:
+        next(source)
+    assert "3.png" in str(error.value)
     assert capfd.readouterr().err == ""
 
 
 @pytest.mark.parametrize("part", [slice(None), *PARTS], ids=str)
-def test_a_part_of_a_folder_has_its_images_from_any_start(images, part):
-    folder, wanted = images("walk", 100), range(100)[part]
-    with open_source(folder, start=2, part=part) as source:
-        assert source.frames == len(wanted)
-        found = [(frame.number, number_of(frame.image)) for frame in source]
-    assert found == list(enumerate(wanted))[2:]
+def test_part_of_a_folder_is_read_from_any_start(tmp_path, part):
+    folder, wanted = make_images(tmp_path / "walk", [f"{number}.png" for number in range(100)]), range(100)[part]
+    (folder / f"{wanted[1]}.png").write_bytes(b"nothing")  # an image before the start is not read
+    source = open_source(folder, start=2, part=part)
+    assert source.frames == len(wanted)
+    assert [(number, image) for number, _, image in read(source)] == list(enumerate(wanted))[2:]
 
 
 @pytest.mark.parametrize(
@@ -474,27 +380,9 @@ def test_a_part_of_a_folder_has_its_images_from_any_start(images, part):
     ],
     ids=str,
 )
-def test_a_part_without_frames_is_an_error(images, part, message):
+def test_part_without_frames_is_an_error(five, part, message):
     with pytest.raises(VideoError, match=message):
-        open_source(images("walk", ["0.png"]), part=part)
-
-
-def test_a_cover_picture_before_the_video_is_not_the_video(tmp_path):
-    path = tmp_path / "a.mp4"
-    with av.open(str(path), "w") as container:
-        stream, cover = container.add_stream("mpeg4", rate=25), container.add_stream("mjpeg", rate=25)
-        cover.disposition = Disposition.attached_pic
-        stream.width, stream.height, stream.pix_fmt = 160, 120, "yuv420p"
-        cover.width, cover.height, cover.pix_fmt = 160, 120, "yuvj420p"
-        for each, number in ((stream, 7), (cover, 99)):
-            container.mux(each.encode(av.VideoFrame.from_ndarray(numbered(number), format="bgr24")))
-        container.mux([*stream.encode(None), *cover.encode(None)])
-    data = path.read_bytes()
-    track, tags = data.index(b"trak") - 4, data.index(b"udta") - 4
-    path.write_bytes(data[:track] + data[tags:] + data[track:tags])
-    with open_source(path) as source:
-        assert source.frames == 1
-        assert numbers(source) == [7]
+        open_source(five, part=part)
 
 
 #: How 0, 1, 2 ... 255 is stored in an image of one channel, or of more than 8 bits.
@@ -508,7 +396,7 @@ DEEP: dict[str, tuple[str, Callable[[np.ndarray], np.ndarray]]] = {
 
 
 @pytest.mark.parametrize(("suffix", "stored"), DEEP.values(), ids=DEEP)
-def test_images_of_more_than_8_bits_are_scaled_by_the_range_of_the_first_one(tmp_path, suffix, stored):
+def test_deep_images_are_scaled_by_the_range_of_the_first(tmp_path, suffix, stored):
     first = np.arange(256, dtype=np.uint8).repeat(20).reshape(64, 80)
     for number, grey in enumerate([first, first // 2 + 30, first[::-1]]):
         cv2.imwrite(str(tmp_path / f"{number}{suffix}"), stored(grey))
@@ -519,58 +407,48 @@ def test_images_of_more_than_8_bits_are_scaled_by_the_range_of_the_first_one(tmp
         np.testing.assert_array_equal(second, np.dstack([wanted] * 3))
 
 
-def test_all_pages_of_an_image_file_are_read_but_only_the_first_one_in_a_folder(tmp_path, caplog):
-    pages = [numbered(number) for number in range(40)]
+def test_image_file_has_all_its_pages_but_one_in_a_folder(tmp_path, caplog):
     animation = cv2.Animation()
-    animation.frames, animation.durations = pages, np.full(40, 40, np.int32)
-    cv2.imwritemulti(str(tmp_path / "a.tif"), pages)
+    animation.frames, animation.durations = [numbered(number) for number in range(40)], np.full(40, 40, np.int32)
+    cv2.imwritemulti(str(tmp_path / "a.tif"), animation.frames)
     for suffix in ("webp", "png", "gif"):
         cv2.imwriteanimation(str(tmp_path / f"a.{suffix}"), animation)
     for suffix in ("tif", "webp", "png", "gif"):
         source = open_source(tmp_path / f"a.{suffix}")
         assert source.frames == 40
-        assert numbers(source) == list(range(40))
-    assert numbers(open_source(tmp_path / "a.tif", 2, part=slice(30, None, 3))) == [36, 39]
+        assert shown(source) == list(range(40))
+    assert shown(open_source(tmp_path / "a.tif", 2, part=slice(30, None, 3))) == [36, 39]
     assert not caplog.messages
-    assert numbers(open_source(tmp_path / "*.tif")) == [0]
+    assert shown(open_source(tmp_path / "*.tif")) == [0]
     assert "a.tif has 40 pages" in caplog.messages[0]
 
 
-def test_images_before_the_first_frame_are_not_read(images):
-    folder = images("walk", 5)
-    (folder / "0.png").write_bytes(b"nothing")
-    with open_source(folder, 2) as source:
-        assert [frame.number for frame in source] == [2, 3, 4]
-
-
-def test_images_of_another_size_are_scaled_to_the_first_one_also_from_a_later_start(images):
-    folder = images("walk", 5)
-    cv2.imwrite(str(folder / "3.png"), numbered(3, width=150))
-    for start in (0, 3):
-        with open_source(folder, start, resize=True) as source:
-            assert [frame.image.shape for frame in source] == [(120, 160, 3)] * (5 - start)
+@pytest.mark.parametrize("start", [0, 3])
+def test_images_of_another_size_are_scaled_to_the_first(five, start):
+    cv2.imwrite(str(five / "3.png"), numbered(3, 150))
+    with open_source(five, start, resize=True) as source:
+        assert [frame.image.shape for frame in source] == [(120, 160, 3)] * (5 - start)
 
 
 @pytest.mark.parametrize(
-    ("place", "message"),
+    ("path", "message"),
     [
         ("empty", "neither images nor a video"),
         ("missing.mp4", "no video or folder"),
         ("empty/%05d.png", "no images at"),
         ("empty/*.png", "no images at"),
         ("notes.txt", "pass a video file, a folder of images"),
-        ("notes.mp4", "pass a video file, a folder of images"),
         ("nothing.mp4", "pass a video file, a folder of images"),
         ("pipe.mpg", r"is a pipe or a device, .* write the video to a file"),
         ("-", "write the video to a file"),
         ("file://elsewhere/walk.mp4", "another machine"),
     ],
 )
-def test_what_is_no_source_is_an_error_that_names_the_alternatives(tmp_path, monkeypatch, place, message):
+def test_invalid_source_is_an_error_with_the_alternatives(tmp_path, monkeypatch, path, message):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "empty").mkdir()
-    for name, text in (("notes.txt", "not a video\n" * 50), ("notes.mp4", "not a video\n" * 50), ("nothing.mp4", "")):
-        (tmp_path / name).write_text(text)
+    (tmp_path / "notes.txt").write_text("not a video\n" * 50)
+    (tmp_path / "nothing.mp4").touch()
     os.mkfifo(tmp_path / "pipe.mpg")
     with pytest.raises(VideoError, match=message):
-        open_source(place)
+        open_source(path)

@@ -1,4 +1,4 @@
-"""The times of frames: FFmpeg's best effort, which only grow."""
+"""The times of frames: FFmpeg's best effort, monotonic."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ STAMPS = {
 
 
 @pytest.mark.parametrize(("pts", "dts", "times"), STAMPS.values(), ids=STAMPS)
-def test_times_grow_from_zero_and_are_those_that_ffmpeg_takes(pts, dts, times):
+def test_times_increase_from_zero_as_in_ffmpeg(pts, dts, times):
     clock = FrameClock(25, Fraction(1, 100))
     found = [clock.time(number, *stamps) for number, stamps in enumerate(zip(pts, dts, strict=True))]
     assert [100 * time for time in found] == pytest.approx(times)

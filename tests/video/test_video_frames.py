@@ -1,4 +1,4 @@
-"""Frames by number: for each kind of file, those that `open_source` returns in order."""
+"""Frames by number: for each kind of file, the frames that `open_source` returns in order."""
 
 from __future__ import annotations
 
@@ -15,29 +15,29 @@ from catstream.errors import VideoError
 from catstream.video import video_frames
 from catstream.video.source import ALL_FRAMES, open_source
 from catstream.video.video_frames import VideoFrames
-from tests.video.test_source import damaged, encoded, numbered
+from tests.video.pictures import damaged, make_video, numbered
 
 FRAMES = 40
-B_FRAMES = (("v:x264-params", "keyint=8:bframes=3"),)
-OPEN = (("v:x264-params", "keyint=8:bframes=3:open-gop=1"),)
+B_FRAMES = {"v:x264-params": "keyint=8:bframes=3"}
+OPEN = {"v:x264-params": "keyint=8:bframes=3:open-gop=1"}
 IRREGULAR = tuple((number + number // 3) / 25 for number in range(FRAMES))
 
-#: Name, how it is made, and whether its frames are numbered from the packets alone.
-KINDS = [
-    ("b-frames.mp4", {"options": B_FRAMES}, True),
-    ("open-groups.mp4", {"options": OPEN}, True),
-    ("open-groups.mkv", {"options": OPEN, "sound": 1.0}, True),
-    ("one-keyframe.mp4", {"options": (("v:x264-params", "keyint=999:bframes=2"),)}, True),
-    ("refreshed.mp4", {"options": (("v:x264-params", "keyint=10:intra-refresh=1"),)}, True),
-    ("irregular.mkv", {"options": B_FRAMES, "times": IRREGULAR}, True),
-    ("fragments.mp4", {"options": (("movflags", "frag_keyframe+empty_moov"), *B_FRAMES)}, True),
-    ("turned.mov", {"rotation": 90}, True),
-    ("open-groups.ts", {"options": OPEN, "sound": 1.0}, False),
-    ("raw.h264", {"options": B_FRAMES}, False),
-    ("groups.flv", {"options": B_FRAMES}, False),
-    ("pictures.avi", {}, False),
-    ("groups.mpg", {"options": (("v:g", "6"), ("v:bf", "2"))}, False),
-]
+#: Videos by name, how they are made, and whether their frames are numbered from the packets alone.
+KINDS = {
+    "b-frames.mp4": ({"options": B_FRAMES}, True),
+    "open-groups.mp4": ({"options": OPEN}, True),
+    "open-groups.mkv": ({"options": OPEN, "sound": 1.0}, True),
+    "one-keyframe.mp4": ({"options": {"v:x264-params": "keyint=999:bframes=2"}}, True),
+    "refreshed.mp4": ({"options": {"v:x264-params": "keyint=10:intra-refresh=1"}}, True),
+    "irregular.mkv": ({"options": B_FRAMES, "times": IRREGULAR}, True),
+    "fragments.mp4": ({"options": {"movflags": "frag_keyframe+empty_moov", **B_FRAMES}}, True),
+    "turned.mov": ({"rotation": 90}, True),
+    "open-groups.ts": ({"options": OPEN, "sound": 1.0}, False),
+    "raw.h264": ({"options": B_FRAMES}, False),
+    "groups.flv": ({"options": B_FRAMES}, False),
+    "pictures.avi": ({}, False),
+    "groups.mpg": ({"options": {"v:g": "6", "v:bf": "2"}}, False),
+}
 
 
 def sequence(path: Path, part: slice = ALL_FRAMES, **settings: object) -> tuple[list[np.ndarray], list[float], dict]:
@@ -65,20 +65,11 @@ def small_cache(monkeypatch):
     monkeypatch.setattr(video_frames, "_CACHE_BYTES", 5 * 160 * 120 * 12 // 8)
 
 
-@pytest.fixture
-def made(tmp_path):
-    def make(name: str, how: dict) -> Path:
-        path = tmp_path / name
-        path.write_bytes(encoded(path.suffix, FRAMES, **how))
-        return path
-
-    return make
-
-
 @pytest.mark.parametrize("part", [ALL_FRAMES, slice(5, 33, 3)], ids=str)
-@pytest.mark.parametrize(("name", "how", "from_packets"), KINDS, ids=[kind[0] for kind in KINDS])
-def test_frames_in_any_order_are_those_in_order(made, name, how, from_packets, part):
-    path = made(name, how)
+@pytest.mark.parametrize("name", KINDS)
+def test_frames_by_number_equal_the_frames_in_order(tmp_path, name, part):
+    options, from_packets = KINDS[name]
+    path = make_video(tmp_path / name, FRAMES, **options)
     frames = VideoFrames(path, part)
     images, times, _ = sequence(path, part)
     assert np.array_equal(frames[0], images[0])
@@ -89,8 +80,8 @@ def test_frames_in_any_order_are_those_in_order(made, name, how, from_packets, p
 
 
 @pytest.mark.parametrize("name", ["b-frames.mp4", "open-groups.mkv", "open-groups.ts", "raw.h264", "groups.mpg"])
-def test_frames_around_damage_are_those_in_order(made, name):
-    path = damaged(made(name, {kind: how for kind, how, _ in KINDS}[name]), 0.6)
+def test_frames_around_damage_equal_the_frames_in_order(tmp_path, name):
+    path = damaged(make_video(tmp_path / name, FRAMES, **KINDS[name][0]), 0.6)
     images, times, counters = sequence(path, skip_damaged=True)
     frames = VideoFrames(path, settings=RunSettings(skip_damaged=True))
     frames.scan()
@@ -110,8 +101,8 @@ def test_frames_around_damage_are_those_in_order(made, name):
     assert_same(frames, images, times)
 
 
-def test_the_frames_before_the_end_of_a_truncated_file_are_read(made):
-    path = made("b-frames.mkv", {"options": B_FRAMES})
+def test_truncated_file_is_read_to_its_end(tmp_path):
+    path = make_video(tmp_path / "b-frames.mkv", FRAMES, B_FRAMES)
     path.write_bytes(path.read_bytes()[: path.stat().st_size * 6 // 10])
     frames = VideoFrames(path)
     frames.scan()
@@ -121,7 +112,7 @@ def test_the_frames_before_the_end_of_a_truncated_file_are_read(made):
 
 
 @pytest.mark.parametrize("kind", ["folder", "pages.tiff"])
-def test_images_are_read_by_their_number(tmp_path, kind):
+def test_images_are_read_by_number(tmp_path, kind):
     path, images = tmp_path / kind, [numbered(number) for number in range(40)]
     if kind == "folder":
         path.mkdir()
@@ -139,8 +130,8 @@ def test_images_are_read_by_their_number(tmp_path, kind):
         assert len(frames) == 3
 
 
-def test_a_copy_in_another_process_reads_the_same_frames(made):
-    path = made("b-frames.mp4", {"options": B_FRAMES})
+def test_pickled_copy_reads_the_same_frames(tmp_path):
+    path = make_video(tmp_path / "b-frames.mp4", FRAMES, B_FRAMES)
     frames = VideoFrames(path)
     frames.scan()
     images, times, _ = sequence(path)
