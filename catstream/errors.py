@@ -33,11 +33,11 @@ class BoxError(CatstreamError, ValueError):
 
 
 class ObjectError(CatstreamError, ValueError):
-    """The name of an object is not valid, is in use, or belongs to no object; or there are too many objects."""
+    """The name of an object is invalid, in use or unknown; or there are too many objects."""
 
 
 class FrameError(CatstreamError, ValueError):
-    """An array is not a frame: its type, shape, size or range of values is wrong. Or its time is not finite."""
+    """An array is not a valid frame (type, shape, size, range of values), or its time is not finite."""
 
 
 class VideoError(CatstreamError):
@@ -61,19 +61,19 @@ class StreamRewoundError(ServiceError):
 
 
 class SilenceError(ServiceError, TimeoutError):
-    """No message arrived from a pipeline within the time-out."""
+    """No message arrived from a pipeline before the timeout."""
 
 
 class CommandRejectedError(ServiceError):
-    """A running pipeline did not carry out a command; the message has the reason."""
+    """A running pipeline rejected a command; the message has the reason."""
 
 
 class FleetError(ServiceError):
-    """A fleet cannot do what was asked for; the message names the stream or the node."""
+    """A fleet cannot execute a request; the message names the stream or the node."""
 
 
 class FencedError(FleetError):
-    """Another holder has claimed a stream since; this one may not write its state any more, and has to stop."""
+    """Another process has claimed a stream; this one must stop, and may not write the state of the stream."""
 
 
 class StoreError(FleetError):
@@ -82,7 +82,7 @@ class StoreError(FleetError):
 
 @contextmanager
 def errors_in(where: str, kind: type[CatstreamError]) -> Iterator[None]:
-    """A block whose errors become errors of this kind, with the place before their text."""
+    """Convert the errors of a block to errors of this kind, prefixed with `where`."""
     try:
         yield
     except CatstreamError as error:
@@ -90,7 +90,7 @@ def errors_in(where: str, kind: type[CatstreamError]) -> Iterator[None]:
 
 
 def require_linux() -> None:
-    """Raise ServiceError on another system, which lacks what the processes of a pipeline need."""
+    """Raise ServiceError unless this is Linux, which the processes of a pipeline require."""
     if sys.platform != "linux":
         raise ServiceError(
             "a pipeline requires Linux: use catstream.Tracker, MultiTracker, annotate and find, or the commands batch, "
@@ -99,7 +99,7 @@ def require_linux() -> None:
 
 
 def require_fleet() -> None:
-    """Raise MissingExtraError if a package of the extra `fleet` is not installed; none is imported."""
+    """Raise MissingExtraError if a package of the extra `fleet` is not installed, without importing it."""
     if missing := [module for module in ("ray", "obstore") if find_spec(module) is None]:
         raise MissingExtraError(
             f"a fleet needs packages that are not installed ({', '.join(missing)}): {install_command('fleet')}"
@@ -107,10 +107,10 @@ def require_fleet() -> None:
 
 
 def install_command(extra: str) -> str:
-    """Return the command that adds an extra to the catstream that is installed in this environment.
+    """Return the command that installs an extra in this environment.
 
-    It works for a checkout too: pip keeps the installed catstream and adds the packages of the extra.
+    It also works for a checkout: pip keeps the installed catstream and adds the packages of the extra.
     """
-    beside = Path(sys.executable).with_name("pip")
-    pip = "pip" if shutil.which("pip") == str(beside) else f"{shlex.quote(sys.executable)} -m pip"
+    own = Path(sys.executable).with_name("pip")
+    pip = "pip" if shutil.which("pip") == str(own) else f"{shlex.quote(sys.executable)} -m pip"
     return f'{pip} install "catstream[{extra}]"'

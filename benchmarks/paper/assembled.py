@@ -83,7 +83,7 @@ class Shared:
     def follow(self, image: np.ndarray) -> tuple[float, Box]:
         """Return the cached result of SCM for a frame."""
         if self.told == len(self.found):
-            self.found.append(self.model.follow(image))
+            self.found.append(self.model.track(image))
         self.told += 1
         return self.found[self.told - 1]
 

@@ -1,4 +1,4 @@
-"""Types of arrays by dtype; the docstrings say their shapes. And whether an array is finite."""
+"""Array types by dtype (the docstrings state the shapes), and a fast check for finite values."""
 
 from __future__ import annotations
 
@@ -22,5 +22,5 @@ def is_finite(array: np.ndarray) -> bool:
     >>> is_finite(np.array([1.0, 1e200])), is_finite(np.array([1.0, np.nan]))
     (True, False)
     """
-    # The sum of the squares is finite only if all numbers are; otherwise it may have overflown.
+    # A finite sum of squares implies finite numbers. An infinite one may be an overflow: check each number.
     return math.isfinite(np.vdot(array, array)) or bool(np.isfinite(array).all())

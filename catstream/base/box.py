@@ -1,8 +1,8 @@
 """Boxes and windows: axis-aligned rectangles in pixels, `x, y, w, h`.
 
-A `Box` is reported: tight around the object, as in the benchmarks. A `Window` is cut from the
-frame, searched and learned from: the box with some of its surroundings, 1.25 times as wide and high. They are two
-types, so that mypy finds where one stands for the other. `Window.around` and `Window.box` convert.
+A `Box` is the reported result: tight around the object, as in the benchmarks. A `Window` is the region that features
+are computed from: the box with some of its surroundings, 1.25 times as wide and high. With two types, mypy detects a
+confusion. `Window.around` and `Window.box` convert.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from msgspec import Meta
 
 from catstream.errors import BoxError
 
-#: Numbers of a rectangle in a message; a rectangle that is made here is not checked.
+#: Bounds that are checked when a message is decoded; the constructor checks nothing.
 _Coordinate = Annotated[float, Meta(ge=-sys.float_info.max, le=sys.float_info.max)]
 _Side = Annotated[float, Meta(gt=0, le=sys.float_info.max)]
 
-_CONTEXT = 1.25  # width of a window in widths of its box: with its outline, an object is located better than with 1
+_CONTEXT = 1.25  # window to box: an object is located better with its outline than with a factor of 1
 
 
 class _Rectangle(NamedTuple):
@@ -117,7 +117,7 @@ class Box(_Rectangle):
         return cls(x, y, w, h)
 
     def rounded(self) -> tuple[int, int, int, int]:
-        """Return x, y, w, h in whole pixels, at least one wide and high, as `cv2.rectangle` takes them.
+        """Return x, y, w, h in whole pixels, at least one wide and high, for `cv2.rectangle`.
 
         Examples
         --------
@@ -128,12 +128,12 @@ class Box(_Rectangle):
         return left, top, max(right - left, 1), max(bottom - top, 1)
 
     def checked(self) -> Box:
-        """Return the box unchanged if tracking can start with it in some frame.
+        """Return the box unchanged if its numbers are finite and it is at least 2 pixels wide and high.
 
         Raises
         ------
         BoxError
-            If a number is not finite, or the box has no area.
+            If it is not.
         """
         if not all(math.isfinite(value) for value in self):
             raise BoxError(f"a box needs four finite numbers, got {self}: pass x,y,w,h in pixels")
@@ -147,8 +147,7 @@ class Box(_Rectangle):
         Raises
         ------
         BoxError
-            If `checked` raises it, the box is more than twice as wide or high as the frame, or its centre lies outside
-            the frame.
+            If `checked` fails, the box is more than twice as wide or high as the frame, or its centre lies outside it.
         """
         self.checked()
         # With its centre inside the frame, such a box covers the whole frame: it does not select an object.

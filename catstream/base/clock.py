@@ -1,17 +1,16 @@
-"""A clock for time limits that stands still while this process is stopped: by SIGSTOP, or in a frozen container."""
+"""A clock for timeouts that pauses while this process is suspended, by SIGSTOP or in a frozen container."""
 
 from __future__ import annotations
 
 from time import monotonic
 
-STEP_SECONDS = 0.5  #: the most that counts between two calls
+STEP_SECONDS = 0.5  #: maximum time that is counted between two calls
 
 
 class RunningClock:
-    """Seconds in which this process ran, if it is called at least every `STEP_SECONDS`.
+    """Seconds for which this process has run, if it is called at least every `STEP_SECONDS`.
 
-    A process that was stopped reads the time first when it continues: a limit would be over although nothing that it
-    waits for could arrive.
+    A process that resumes reads the time before its messages: by another clock, its timeouts would have expired.
     """
 
     def __init__(self) -> None:

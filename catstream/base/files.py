@@ -1,4 +1,4 @@
-"""Files: written atomically, locked, and checked before the work; the folder of the user's state."""
+"""Files: atomic writes, locks, and early checks of output paths; the folder of the user's state."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ try:
 except ImportError:  # Windows
     fcntl = None  # type: ignore[assignment]
 
-ABANDONED_SECONDS = 600.0  #: after which nothing writes a part of a file any more
+ABANDONED_SECONDS = 600.0  #: age at which an unfinished file is abandoned
 
-#: Errors of a disk that may pass -> what to do.
+#: Temporary errors of a disk, and their remedies.
 REMEDIES = {
     errno.ENOSPC: "free space on the disk",
     errno.EDQUOT: "free space, or raise the quota",
@@ -44,38 +44,38 @@ def state_home() -> Path:
 
 
 def write_atomically(path: str | os.PathLike[str], data: bytes, mode: int = 0o666) -> None:
-    """Replace a file atomically; the new content then survives a power cut. The umask reduces the permissions `mode`.
+    """Replace a file atomically; the new content then survives a power failure. The umask applies to `mode`.
 
-    OSError if the file cannot be written; the old one stays unchanged.
+    OSError if the file cannot be written; the old content then remains.
     """
     path = Path(path)
     remove_parts(path)
-    with _written_beside(path, data, mode) as part:
+    with _temporary(path, data, mode) as part:
         part.replace(path)
 
 
 def create_atomically(path: str | os.PathLike[str], data: bytes) -> None:
-    """Create a file for its owner only: it exists with its whole content, or not at all, also after a power cut.
+    """Create a private file: it exists with its whole content or not at all, even after a power failure.
 
-    FileExistsError if it exists, also if two processes create it at the same moment; OSError if it cannot be written.
+    FileExistsError if it exists, even if two processes create it at the same time; OSError if it cannot be written.
     """
     path = Path(path)
-    with _written_beside(path, data, 0o600) as part:
+    with _temporary(path, data, 0o600) as part:
         os.link(part, path)  # unlike a rename, this fails if the file exists
 
 
 @contextlib.contextmanager
-def _written_beside(path: Path, data: bytes, mode: int) -> Iterator[Path]:
-    """A new file in the folder of `path` whose content is on disk; after the block, its new name is on disk as well.
+def _temporary(path: Path, data: bytes, mode: int) -> Iterator[Path]:
+    """Write a temporary file next to `path`, synced to disk; its folder is synced after the block.
 
-    Its name is its own, so that several may write `path` at the same time. It is removed if the block leaves it there.
+    Its name is unique, so several processes may write `path` at the same time. It is removed unless the block moves it.
     """
     part = path.with_name(f".{path.name}.{secrets.token_hex(8)}.part")
     try:
         with os.fdopen(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb") as file:
             file.write(data)
             file.flush()
-            os.fsync(file.fileno())  # the content must be on disk before the new name
+            os.fsync(file.fileno())  # the content must be on disk before the rename
         yield part
         sync(path.parent)
     finally:
@@ -84,7 +84,7 @@ def _written_beside(path: Path, data: bytes, mode: int) -> Iterator[Path]:
 
 
 def remove_parts(path: Path) -> None:
-    """Remove the unfinished files for a file that processes left when they were killed while writing it."""
+    """Remove the temporary files of processes that were killed while writing `path`."""
     for part in path.parent.glob(f".{glob.escape(path.name)}.*.part"):
         with contextlib.suppress(OSError):
             if part.stat().st_mtime < time.time() - ABANDONED_SECONDS:
@@ -93,10 +93,10 @@ def remove_parts(path: Path) -> None:
 
 @contextlib.contextmanager
 def writing(path: str | os.PathLike[str], kind: type[CatstreamError] = ServiceError) -> Iterator[None]:
-    """A block that writes a file, or into a folder: an OSError in it becomes an error of this kind, for a person."""
+    """Convert an OSError while writing a file or folder to an error of this kind, with a remedy."""
     try:
         yield
-    except BrokenPipeError:  # the reader of standard output has ended, as `head` does: not an error of catstream
+    except BrokenPipeError:  # the reader of standard output has exited, for example `head`: no error
         raise
     except OSError as error:
         remedy = REMEDIES.get(error.errno or 0, "use another folder")
@@ -113,7 +113,7 @@ def check_file(
 ) -> None:
     """Raise an error of this kind if a file exists and may not be replaced, or cannot be written.
 
-    The folder `made` is made before the file, if it does not exist. If the file `may_wait`, a full disk is no error.
+    The folder `made` may be missing, because it is created later. If the file `may_wait`, a full disk is no error.
     """
     if path.exists() and not overwrite:
         raise kind(f"{path} exists already: replace it with --overwrite, or use another name")
@@ -133,9 +133,9 @@ def check_file(
 
 @contextlib.contextmanager
 def descriptor(path: Path, flags: int = os.O_RDONLY) -> Iterator[int]:
-    """A descriptor to lock a file or folder with; OSError if it cannot be opened.
+    """Open a descriptor for locking a file or folder; OSError if it cannot be opened.
 
-    It is closed in a copy of this process that is forked, which would hold the lock for the rest of its own life.
+    It is closed in forked processes, which would otherwise hold the lock until they exit.
     """
     handle, since = os.open(path, flags, 0o600), generation()
     _descriptors.add(handle)
@@ -144,7 +144,7 @@ def descriptor(path: Path, flags: int = os.O_RDONLY) -> Iterator[int]:
     finally:
         if not forked(since):
             _descriptors.remove(handle)
-            _flock(handle, "LOCK_UN")  # a copy that is just beginning may have it yet
+            _flock(handle, "LOCK_UN")  # a process that was just forked may not have closed it yet
             os.close(handle)
 
 
@@ -161,7 +161,7 @@ after_fork(_close_descriptors)
 
 
 def lock(handle: int, seconds: float = 0.0) -> bool:
-    """Lock an open file or folder until it is closed or this process ends; False if another keeps it for `seconds`."""
+    """Lock an open file or folder until it is closed; False if another process still has it after `seconds`."""
     deadline = time.monotonic() + seconds
     while not (locked := _flock(handle, "LOCK_EX")) and time.monotonic() < deadline:
         time.sleep(0.05)
@@ -169,7 +169,7 @@ def lock(handle: int, seconds: float = 0.0) -> bool:
 
 
 def is_locked(handle: int) -> bool:
-    """Return True if another process has locked an open file; asked with a shared lock, so that two may ask at once."""
+    """Return True if another process has locked an open file; tests with a shared lock, so tests do not conflict."""
     return not _flock(handle, "LOCK_SH")
 
 
@@ -191,9 +191,9 @@ def _flock(handle: int, kind: str) -> bool:
 
 
 def open_locked(path: Path, kind: type[CatstreamError] = ServiceError, size: int | None = 0, **options: Any) -> IO[Any]:
-    """Open a file to append to it, in a folder that is made, and lock it until it is closed.
+    """Open a file for appending, create its folder, and lock the file until it is closed.
 
-    size     number of its first bytes that remain, 0 for a new file; None for all
+    size     bytes to truncate the file to, 0 for a new file; None for no truncation
     options  of `open`
 
     An error of this kind if another process has locked it, or if it cannot be written.
@@ -218,9 +218,9 @@ def locked_folder(
     mode: int = 0o777,
     busy: str = "",
 ) -> Iterator[None]:
-    """Make a folder if it does not exist, and lock it for a block.
+    """Create a folder if it does not exist, and lock it for a block.
 
-    An error of this kind if it cannot be made, or if another process keeps it locked for `seconds`: the text `busy`.
+    An error of this kind if it cannot be created, or, with the text `busy`, if it is still locked after `seconds`.
     """
     with contextlib.ExitStack() as stack:
         with writing(folder, kind):
@@ -240,7 +240,7 @@ def check_unlocked(path: Path, kind: type[CatstreamError] = ServiceError) -> Non
 
 
 def _busy(path: Path) -> str:
-    """The error about a file that a process has locked, with its id: the kernel lists the locks of this machine."""
+    """Error text for a locked path, with the id of the process if /proc/locks lists it."""
     holder = "another process"
     with contextlib.suppress(OSError):
         locks = Path("/proc/locks").read_text()
@@ -250,7 +250,7 @@ def _busy(path: Path) -> str:
 
 
 def check_distinct(files: Iterable[tuple[str, Path]], kind: type[CatstreamError] = ServiceError) -> None:
-    """Raise an error of this kind if two files, each after its purpose, are the same, also through links.
+    """Raise an error of this kind if two of the pairs (purpose, path) are the same file, even through links.
 
     >>> check_distinct([("the results", Path("a.csv")), ("the model of anna", Path("./a.csv"))])
     Traceback (most recent call last):
@@ -265,7 +265,7 @@ def check_distinct(files: Iterable[tuple[str, Path]], kind: type[CatstreamError]
 
 
 def sync(path: Path) -> None:
-    """Write the content of a file, or the entries of a folder, to disk; Windows has no descriptor of a folder."""
+    """Sync a file, or the entries of a folder, to disk; no effect on Windows, which cannot open folders."""
     if os.name != "posix":
         return
     handle = os.open(path, os.O_RDONLY)

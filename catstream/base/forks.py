@@ -1,8 +1,8 @@
-"""Copies of this process that a program forks: an object that such a copy inherited is not its own.
+"""Fork safety: a forked process must neither use nor clean up the objects that it inherited.
 
-A fork copies memory and descriptors, but no thread: a copy that closed a socket, removed a file or stopped a process of
-the original would break it. Whoever makes such an object remembers the `generation`, and asks `forked` before it cleans
-up, or calls `check_not_forked` before it uses the object. State of a module is replaced by `after_fork`.
+A fork copies memory and descriptors, but no threads. A child that closed a socket, removed a file or stopped a process
+of its parent would break the parent. Such an object stores the `generation` of its creation. It checks `forked` before
+a cleanup, and `check_not_forked` before its use. `after_fork` resets the state of a module.
 """
 
 from __future__ import annotations
@@ -16,17 +16,17 @@ _generation = 0
 
 
 def generation() -> int:
-    """The number of forks between the first process of the program and this one."""
+    """Number of forks between the first process of the program and this one."""
     return _generation
 
 
 def forked(since: int) -> bool:
-    """Return True if this process is a copy of the one in which `generation` returned `since`."""
+    """Return True if this process was forked since `generation` returned `since`."""
     return _generation != since
 
 
 def check_not_forked(since: int) -> None:
-    """Raise ServiceError if this process is a copy of the one in which `generation` returned `since`."""
+    """Raise ServiceError if this process was forked since `generation` returned `since`."""
     if forked(since):
         raise ServiceError(
             "unusable after a fork (this process is a copy of the one that created it): create it in the process that "
@@ -35,7 +35,7 @@ def check_not_forked(since: int) -> None:
 
 
 def after_fork(function: Callable[[], object]) -> None:
-    """Call a function in each process that is forked from this one, before anything else."""
+    """Call a function first in each process that is forked from this one."""
     if hasattr(os, "register_at_fork"):  # Windows has no fork
         os.register_at_fork(after_in_child=function)
 

@@ -1,7 +1,7 @@
 """The motion of a centre: a Kalman filter with a constant-velocity model.
 
 The state is (x, y, vx, vy), in pixels and pixels a frame; x and y are measured. The results equal filterpy's, bit
-for bit, without its second of imports; the trainer smooths with filterpy.
+for bit, but filterpy takes a second to import. The trainer smooths with filterpy.
 """
 
 from __future__ import annotations
@@ -30,5 +30,5 @@ def update(
     innovation = OBSERVATION @ covariance @ OBSERVATION.T + observation
     gain = covariance @ OBSERVATION.T @ np.linalg.inv(innovation)
     rest = np.eye(4) - gain @ OBSERVATION
-    covariance = rest @ covariance @ rest.T + gain @ observation @ gain.T  # of Joseph: it stays symmetric
+    covariance = rest @ covariance @ rest.T + gain @ observation @ gain.T  # Joseph form: stays symmetric
     return mean + gain @ (centre - OBSERVATION @ mean), covariance

@@ -1,4 +1,4 @@
-"""Names of objects: each object of a stream has its own. A single object may have none; its name is then ""."""
+"""Names of objects, unique within a stream. A single object may be unnamed: its name is then ""."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from catstream.base.box import Box
 from catstream.base.text import listed
 from catstream.errors import BoxError, ObjectError
 
-#: The name of an object that has none.
+#: The name of an unnamed object.
 UNNAMED = ""
 
-#: The boxes of objects: of one object without a name, or by name.
+#: The boxes of objects by name, or the box of one unnamed object.
 Boxes = str | Iterable[float] | Mapping[str, str | Iterable[float]]
 
 _Value = TypeVar("_Value")
@@ -24,7 +24,7 @@ _Value = TypeVar("_Value")
 _LONGEST = 64
 #: Blocks of Unicode with the combining marks of living scripts; a search through all of it would take half a second.
 _SCRIPTS = chain(range(0x300, 0x2100), range(0xA600, 0xAC00), range(0x11000, 0x11800), range(0x1E000, 0x1F000))
-#: Vowel signs and accents, which `\w` lacks, and the two joiners that Persian and the scripts of India write with.
+#: Vowel signs and accents, which `\w` lacks, and the two joiners of Persian and the Indic scripts.
 _MARKS = "".join(mark for mark in map(chr, _SCRIPTS) if category(mark).startswith("M")) + "\u200c\u200d"
 #: Regular expression of the name of an object.
 PATTERN = rf"(\w[\w{_MARKS}.-]{{0,{_LONGEST - 1}}})?"
@@ -42,11 +42,11 @@ def check_name(name: str) -> str:
             f"{name!r:.80} is not a name: expected text of 1 to {_LONGEST} letters, digits, '_', '-' and '.', "
             "the first of them a letter, a digit or '_'"
         )
-    return str(composed)  # also of a text of numpy
+    return str(composed)  # converts a string of numpy
 
 
 def by_name(values: Mapping[str, _Value]) -> dict[str, _Value]:
-    """The values of objects by their checked names; ObjectError if one is not valid, or two are the same in Unicode.
+    """Check the names of a mapping; ObjectError if one is not valid, or two have the same composed form.
 
     >>> by_name({"Zoe\u0308": 1})
     {'Zoë': 1}
@@ -89,7 +89,7 @@ def boxes_by_name(boxes: Boxes) -> dict[str, Box]:
 
 
 def check_boxes(boxes: Mapping[str, Box], width: int, height: int) -> None:
-    """Raise BoxError, with the name of the object, if tracking cannot start with one of the boxes in such a frame."""
+    """Raise BoxError, with the name of the object, if a box is not valid in a frame of this size."""
     for name, box in boxes.items():
         with errors_about(name):
             box.validated(width, height)
@@ -97,17 +97,17 @@ def check_boxes(boxes: Mapping[str, Box], width: int, height: int) -> None:
 
 @contextmanager
 def errors_about(name: str) -> Iterator[None]:
-    """Add the name of an object to a BoxError."""
+    """Prefix a BoxError with the name of its object."""
     try:
         yield
     except BoxError as error:
         raise BoxError(f"{name}: {error}" if name else str(error)) from None
 
 
-def check_count(count: int, most: int) -> None:
+def check_count(count: int, limit: int) -> None:
     """Raise ObjectError if there are more objects than allowed."""
-    if count > most:
+    if count > limit:
         raise ObjectError(
-            f"too many objects ({count}, limit {most}): track fewer, or raise the limit "
+            f"too many objects ({count}, limit {limit}): track fewer, or raise the limit "
             f"(--set run.max_objects={count}, up to 64)"
         )

@@ -34,7 +34,7 @@ _Timeout = Annotated[float, Meta(ge=0.1, le=3600)]
 
 
 class _Group(Struct, frozen=True, kw_only=True):
-    """A group of settings, which checks its values. Its docstring has a row for each of them."""
+    """A group of settings with validated values. The docstring of a subclass has a row for each setting."""
 
     def __post_init__(self) -> None:
         group = next(name for name, kind in _groups().items() if isinstance(self, kind))
@@ -237,7 +237,7 @@ class Settings:
         overrides: Mapping[str, object] | Iterable[str] = (),
         environment: Mapping[str, str] | None = None,
     ) -> dict[str, object]:
-        """Collect the names and values that are set in some source, unchecked, for `from_values` or `replace`.
+        """Collect the values that are set in any source, unchecked, for `from_values` or `replace`.
 
         Parameters
         ----------
@@ -246,14 +246,14 @@ class Settings:
         file : path or None
             A TOML file with a table for each group.
         overrides : mapping of str, or iterable of str
-            Names and values, or texts `group.name=value` as `--set` takes them.
+            Names and values, or texts `group.name=value` as for `--set`.
         environment : mapping of str, or None
-            Variables, `CATSTREAM_GROUP_NAME=value`; None for `os.environ`. Those that resemble no setting are ignored.
+            Variables, `CATSTREAM_GROUP_NAME=value`; None for `os.environ`. Unrelated ones are ignored.
 
         Raises
         ------
         SettingsError
-            For an unknown preset, a file that cannot be read, or a variable that is empty or of no setting.
+            For an unknown preset, a file that cannot be read, or an empty or unknown variable.
         """
         values: dict[str, object] = {}
         if preset is not None:
@@ -264,7 +264,7 @@ class Settings:
             values.update(flat(read_toml(Path(file), SettingsError)))
         for variable, text in (os.environ if environment is None else environment).items():
             name = variable.removeprefix("CATSTREAM_").lower().replace("_", ".", 1)
-            # A variable that resembles no setting is for something else: Kubernetes sets CATSTREAM_SERVICE_HOST.
+            # Ignore variables that resemble no setting: Kubernetes sets CATSTREAM_SERVICE_HOST.
             if variable.startswith("CATSTREAM_") and (name in describe() or _nearest(name)):
                 _check_name(name, f" for the environment variable {variable}")
                 if not text:
@@ -308,7 +308,7 @@ class Settings:
         return self.replace({"coreset.size": max(2, round(self.coreset.share * frames)), "coreset.share": 0.0})
 
     def replace(self, others: Settings | Mapping[str, object] | None) -> Settings:
-        """Return a copy with other values, given as in `from_values`; with no value, or with values of other settings.
+        """Return a copy with changed values, as for `from_values`; another `Settings` replaces all of them.
 
         Examples
         --------
@@ -359,8 +359,8 @@ class Setting:
     """A row of the list of settings.
 
     name     full name
-    type     of the value: a type of Python or a Literal, which may be annotated with bounds
-    default  value
+    type     a type of Python or a Literal, possibly annotated with bounds
+    default  default value
     about    meaning, and when to change it
     """
 
@@ -388,18 +388,18 @@ class Setting:
 
     def check(self, value: object) -> Value:
         """Convert a value or a text to the type of the setting; SettingsError if it is not valid."""
-        given = value
+        original = value
         if getattr(value, "ndim", None) == 0:  # a number of numpy
             value = value.item()  # type: ignore[attr-defined]
         try:
             if isinstance(value, str) and isinstance(self.default, int | float) and not isinstance(self.default, bool):
-                value = type(self.default)(value)  # ".5" and "007" are numbers of Python, not of JSON
+                value = type(self.default)(value)  # ".5" and "007" are valid in Python, not in JSON
             checked: Value = msgspec.convert(value, self.type, strict=not isinstance(value, str))
             if not isinstance(checked, float) or math.isfinite(checked):
                 return checked
-        except (ValueError, msgspec.ValidationError):  # ValueError: also a byte of the command line that is not UTF-8
+        except (ValueError, msgspec.ValidationError):  # ValueError: also for text that is not UTF-8
             pass
-        raise SettingsError(f"setting {self.name} cannot be {reprlib.repr(given)}: it takes {self.takes}")
+        raise SettingsError(f"setting {self.name} cannot be {reprlib.repr(original)}: expected {self.takes}")
 
 
 @cache
@@ -423,7 +423,7 @@ def _groups() -> dict[str, type[_Group]]:
 
 
 def flat(values: Mapping[str, object]) -> dict[str, object]:
-    """Values by full name, from values by full name or in groups."""
+    """Flatten values in groups to values by full name."""
     flattened: dict[str, object] = {}
     for name, value in values.items():
         if isinstance(value, Mapping):
@@ -434,7 +434,7 @@ def flat(values: Mapping[str, object]) -> dict[str, object]:
 
 
 def _check_name(name: str, origin: str = "") -> None:
-    """Raise SettingsError, with the nearest names, if there is no setting of this name; `origin` is for the error."""
+    """Raise SettingsError, with the nearest names, if there is no setting of this name; the error mentions `origin`."""
     if name not in describe():
         near = " or ".join(map(repr, _nearest(name)))
         suggestion = f", did you mean {near}?" if near else ":"
@@ -463,5 +463,5 @@ def read_toml(path: Path, kind: type[CatstreamError]) -> dict[str, object]:
             return tomllib.load(file)
     except OSError as error:
         raise kind(f"cannot read {path}: {error.strerror}") from None
-    except (ValueError, RecursionError) as error:  # not UTF-8, not TOML, or nested without end
+    except (ValueError, RecursionError) as error:  # not UTF-8, not TOML, or nested too deeply
         raise kind(f"{path}: this is not TOML: {error}") from None

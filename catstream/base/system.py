@@ -1,4 +1,4 @@
-"""Calls of the kernel and of the C library for this process: its parent, its name and its memory."""
+"""Calls to the kernel and the C library about this process: its parent, its name and its memory."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ _ARGUMENTS = slice(45, 47)  # of the fields after the name in /proc/self/stat: a
 
 
 def die_with(parent: int) -> None:
-    """Let the kernel kill this process when its parent ends, so that no orphan is left."""
-    if sys.platform != "linux":  # there, an orphan ends when it reads its next task
+    """Have the kernel kill this process when its parent exits, so that no orphan remains."""
+    if sys.platform != "linux":  # elsewhere, an orphan exits when it reads its next task
         return
     ctypes.CDLL(None).prctl(_SET_PARENT_DEATH_SIGNAL, signal.SIGKILL, 0, 0, 0)
     if os.getppid() != parent:  # the parent ended before the call of prctl
@@ -26,8 +26,7 @@ def die_with(parent: int) -> None:
 def name_process(name: str, command: str = "") -> None:
     """Show a name in `top`, cut after 15 characters, and a command line in `ps`, cut to the length of the present one.
 
-    Every user of the machine can read them. Without a `command`, the present one stays. Systems other than Linux have
-    no such call, and keep the present ones.
+    Every user of the machine can read them. Without a `command`, the present one stays. No effect except on Linux.
     """
     if sys.platform != "linux":
         return
@@ -41,6 +40,6 @@ def name_process(name: str, command: str = "") -> None:
 
 
 def release_memory() -> None:
-    """Return freed memory to the kernel, which glibc keeps for later arrays; other C libraries need no call."""
+    """Return freed memory, which glibc caches, to the kernel; no effect with other C libraries."""
     if trim := getattr(ctypes.CDLL(None), "malloc_trim", None):
         trim(0)

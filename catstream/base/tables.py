@@ -1,7 +1,7 @@
-"""Tables: CSV files that this program, a spreadsheet or a data frame has written.
+"""CSV tables that were written by this program, a spreadsheet or a data frame library.
 
-The first line names the columns, in any order and case. They are separated by commas, semicolons or tabs. Blanks around
-values and empty rows are ignored. Numbers may have a decimal comma, and whole numbers zeros after it, as in 119.0.
+The first line names the columns, in any order and case. Commas, semicolons or tabs separate them. Blanks around
+values and empty rows are ignored. Numbers may have a decimal comma; 119.0 is a whole number.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _Value = TypeVar("_Value")
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """The values of a row by the names of their columns. A ValueError names the column of a value that is wrong."""
+    """The values of a row by column. A ValueError names the column of an invalid value."""
 
     values: dict[str, str]
     separator: str
@@ -66,9 +66,9 @@ class Row:
 
 
 class Columns:
-    """The columns of a table, by which its lines are read.
+    """The header of a table: the names of its columns, and their separator.
 
-    start  number of lines up to the names of the columns
+    start  number of lines up to and including the header
     """
 
     def __init__(self, path: Path, lines: Iterable[str], required: Sequence[str]) -> None:

@@ -1,4 +1,4 @@
-"""Numbers and names in sentences."""
+"""Formats numbers and names for messages."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Iterable
 
 
 def listed(names: Iterable[str]) -> str:
-    """Names of objects, for a message to the user.
+    """Join names of objects for a message.
 
     >>> listed(["anna", ""]), listed([])
     ('anna, the object without a name', 'none')

@@ -1,4 +1,4 @@
-"""Threads: linear algebra on one of them while catstream computes.
+"""Limits linear algebra to one thread while catstream computes.
 
 The matrices are small. With more threads, OpenBLAS spends its time on synchronisation (a tenth of the frame rate), and
 the order of its sums changes, so results are not reproducible. The processes of a pipeline set environment variables
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 #: Environment variables that limit the libraries of a new process to one thread.
 ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
 
-#: Held by a call that changes the filters of warnings: all threads of a program have the same ones.
+#: Lock for changes of the warning filters, which all threads of a program share.
 FILTERS = threading.Lock()
 
 
@@ -35,7 +35,7 @@ def limit_process() -> None:
 
 
 class _Limit:
-    """Limits each BLAS to one thread as long as any call needs it: it has one number for the whole process."""
+    """Limits each BLAS to one thread while any call needs it: the number of threads is per process."""
 
     def __init__(self) -> None:
         self._lock, self._calls = threading.Lock(), 0
@@ -55,10 +55,10 @@ class _Limit:
 
     @staticmethod
     def _controller() -> ThreadpoolController:
-        """The libraries of this process; this thread may set their numbers of threads from now on."""
+        """The BLAS libraries of this process, with the right of this thread to limit them."""
         controller = _libraries("blas")
         for library in controller.lib_controllers:
-            if library.internal_api == "openblas":  # by itself, one thread of a program keeps the right to set it
+            if library.internal_api == "openblas":  # otherwise, only the first thread that set a limit may change it
                 library.clear_controlling_thread(force=True)
         return controller
 
@@ -68,7 +68,7 @@ _limit = _Limit()
 
 def _libraries(kind: str) -> ThreadpoolController:
     """The libraries of a kind that are loaded in this process: "blas" or "openmp"."""
-    import scipy.linalg  # noqa: F401  brings a second BLAS: loaded later, it would have all threads
+    import scipy.linalg  # noqa: F401  loads a second BLAS, which would not be limited if it was loaded later
     from threadpoolctl import get_cached_controller
 
     return get_cached_controller().select(user_api=kind)
@@ -97,7 +97,7 @@ def one_thread(*, opencv: bool = False) -> Iterator[None]:
         threads = cv2.getNumThreads()
         cv2.setNumThreads(1)
     try:
-        with _limit, _libraries("openmp").limit(limits=1):  # OpenMP has a number for each calling thread
+        with _limit, _libraries("openmp").limit(limits=1):  # the limit of OpenMP is per calling thread
             yield
     finally:
         if opencv:

@@ -1,7 +1,7 @@
-"""Processes that run a function of this program: workers of an evaluation, an annotation, and a load test.
+"""Worker processes, for evaluation, annotation and load tests.
 
-They end with their parent. SIGINT stays blocked in them, because on Ctrl-C their parent ends them in order: a worker
-that ended first would be reported as killed.
+They exit with their parent. SIGINT is blocked in them, because on Ctrl-C the parent stops them in order: a worker that
+exited first would be reported as killed.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ from catstream.errors import ServiceError
 
 _Result = TypeVar("_Result")
 
-#: The start method of all of them.
+#: The start method of all workers.
 SPAWN = multiprocessing.get_context("spawn")
 
 
 @contextmanager
 def sigint_blocked() -> Iterator[None]:
-    """Block SIGINT in the processes that are started inside a `with`; a Ctrl-C that arrives inside is handled after it.
+    """Start processes with SIGINT blocked inside a `with`; a Ctrl-C is handled after the block.
 
-    The mask alone does not hold it back: the signal arrives in another thread, and Python handles it in the main one. A
-    process whose start is interrupted would wait for its arguments.
+    Blocking alone is not enough: another thread receives the signal, and Python handles it in the main thread. A
+    process whose start is interrupted would wait for its arguments forever.
     """
     if not hasattr(signal, "pthread_sigmask"):
         yield
@@ -53,7 +53,7 @@ def sigint_blocked() -> Iterator[None]:
 
 @contextmanager
 def sharing() -> Iterator[None]:
-    """A block in which memory or locks for other processes are made: ServiceError if this machine has no place."""
+    """Convert an OSError while shared memory or locks are created to a ServiceError."""
     try:
         yield
     except OSError as error:
@@ -64,7 +64,7 @@ def sharing() -> Iterator[None]:
 
 
 class Workers:
-    """Processes that run functions of this program. They are started by the first tasks, and remain until `close`."""
+    """A pool of processes. The first tasks start them, and `close` stops them."""
 
     def __init__(self, jobs: int) -> None:
         self._jobs = jobs
@@ -92,7 +92,7 @@ class Workers:
     def run(self, work: Callable[..., _Result], tasks: Iterable[tuple[object, ...]]) -> Generator[_Result]:
         """Yield the result of `work(*task)` for each task, in order of completion.
 
-        If the caller stops early, for example on Ctrl-C, all workers are killed; the next tasks start others.
+        If the caller stops early, for example on Ctrl-C, all workers are killed; later tasks start new workers.
         """
         try:
             for future in as_completed([self.submit(work, *task) for task in tasks]):
@@ -102,13 +102,13 @@ class Workers:
             raise
 
     def kill(self) -> None:
-        """Kill the workers, and drop their tasks; the next tasks start others."""
+        """Kill the workers, and drop their tasks; later tasks start new workers."""
         for worker in self._processes:
             worker.kill()
         self.close()
 
     def close(self) -> None:
-        """End the workers after their tasks."""
+        """Stop the workers after their tasks."""
         if self._pool is not None:
             self._pool.shutdown()
         self._pool, self._processes = None, set()
@@ -127,7 +127,7 @@ def run_tasks(work: Callable[..., _Result], tasks: Iterable[tuple[object, ...]],
 
 
 def _end_with_parent() -> None:
-    """End this worker when its parent process ends. `die_with` would end it with the thread that started it."""
+    """Exit when the parent process exits; `die_with` would react to the exit of the thread that started this worker."""
 
     def wait() -> None:
         if (parent := multiprocessing.parent_process()) is not None:

@@ -27,7 +27,7 @@ class CheckpointStore:
     """A folder with the newest two checkpoints, the newest durable one, and the last damaged one.
 
     A checkpoint is written atomically. A durable one is on disk before `save` returns. The others survive `kill -9`,
-    but not a power cut: the kernel writes a file to disk after about 30 s, and they are removed before. No file is
+    but not a power failure: the kernel writes a file to disk after about 30 s, and they are removed earlier. No file is
     overwritten: an older checkpoint is removed after a newer one is complete. If the disk is full, the older ones are
     removed before, but never the newest valid one.
 

@@ -1,6 +1,6 @@
 """The compressor of one object: inserts its features of every frame into coreset trees, and samples them periodically.
 
-It is the only owner of the object's coreset trees, one for each row of `catstream.wire.heads.TREES`.
+It owns the coreset trees of its object, one for each row of `catstream.wire.heads.TREES`.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ SAMPLE_INTERVAL = 8
 #: Frames in a block of centres from which EM learns the parameters of the Kalman filter: enough for its covariances.
 MOTION_FRAMES = 64
 
-_RIGHT = 0.5  # label of a window that is neither too large nor too small, too wide or too high
-_GROWTH = 9 / 8  # factor of the number of leaves from which a sample is due before its interval is over
+_NO_OFFSET = 0.5  # label of a window of the right size and aspect ratio
+_GROWTH = 9 / 8  # growth of the number of leaves that ends an interval early
 
 
 class Compressor:
@@ -71,7 +71,7 @@ class Compressor:
         settings: Settings,
         name: str = "",
     ) -> Compressor:
-        """A compressor that inserts another stream into copies of the trees of an earlier one; call `begin` next."""
+        """Continue copies of the trees of an earlier stream with another stream; call `begin` next."""
         self = cls(settings, name)
         self.trees = {kind: tree.copy() for kind, tree in trees.items()}
         self.last_sample, self.centres = sample_of(self.trees, version, 0, centres, name), centres
@@ -81,7 +81,7 @@ class Compressor:
     def begin(self, frame: int, version: int) -> Sample | None:
         """Begin the object's stream at a frame; returns the sample of the trees of an earlier stream, or None.
 
-        The sample gets the version, the next one of this stream, unless its own is higher.
+        The sample gets `version`, the next one of this stream, unless its own version is higher.
         """
         self.began = frame
         if self.last_sample is not None:
@@ -105,11 +105,11 @@ class Compressor:
         self.frame, self.detector = frame, features.detector
         if features.box is not None:
             self.box = features.box
-        # Step 2: append the centre. Samples contain complete blocks of them, so that motion is trained once per block.
+        # Step 2: append the centre. Samples contain complete blocks of centres, so motion is trained once per block.
         self._path.append(features.box.centre if features.box else (np.nan, np.nan))
         if len(self._path) == MOTION_FRAMES:
             self.centres, self._path = np.array(self._path), []
-        # Step 3: a sample is due if there is a new leaf, and the trees have grown by an eighth or its interval is over.
+        # Step 3: sample if there is a new leaf, and the trees have grown by an eighth or the interval is over.
         if not all(self.trees[name].nodes for name, tree in TREES.items() if tree.required):
             return None
         leaves = self.leaves
@@ -161,8 +161,8 @@ class Compressor:
             "origin": self._origin,
             "earlier": list(self._earlier),
         }
-        # The trees have grown since the last sample. It is stored as well, so that a restarted trainer trains the model
-        # that the detector uses.
+        # The trees have grown since the last sample, which is stored for a restarted trainer: it trains the model that
+        # the detector uses.
         for name, message in (("sample", self.last_sample), ("detector", self.detector)):
             if message is not None:
                 own, metadata[name] = pack(message, name)
@@ -171,7 +171,7 @@ class Compressor:
 
     @classmethod
     def from_state(cls, arrays: Arrays, metadata: Metadata, settings: Settings, name: str = "") -> Compressor:
-        """Restore a compressor from its `state`; KeyError, TypeError or ValueError if it is something else."""
+        """Restore a compressor from its `state`; KeyError, TypeError or ValueError if the state is invalid."""
         self = cls(settings, name)
         self.began, self.frame = int(metadata["began"]), int(metadata["frame"])
         self.box = Box(*metadata["box"]) if metadata["box"] else None
@@ -211,6 +211,6 @@ def _rows_of(tree: Tree, training: TrainingRows) -> Float32:
     np.multiply(rows, roots, out=wide[:, :d])
     wide[:, d] = 1
     wide[:, d + 1] = training.labels
-    wide[:, d + 2 :] = _RIGHT if training.offsets is None else training.offsets
+    wide[:, d + 2 :] = _NO_OFFSET if training.offsets is None else training.offsets
     wide[:, d:] *= roots
     return wide

@@ -1,4 +1,4 @@
-"""The forest: the compressors of all objects of a stream, one for each, and their checkpoint."""
+"""The forest: a compressor for each object of a stream, and the checkpoint of all."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from catstream.wire.messages import DetectorState, Features, Sample
 from catstream.wire.storage import Arrays, Metadata, with_prefix
 
 _KIND = "forest 4"  # kind of file, and the version of its contents
-_MAX_STATES = 256  # messages whose detector states are stored: a restarted detector continues after one of them
+_MAX_STATES = 256  # number of messages with stored detector states, from which a restarted detector continues
 
 
 class Forest:
@@ -49,7 +49,7 @@ class Forest:
             for training in part.training.values():
                 if width and training.rows.shape[1] != width:
                     raise ProtocolError(
-                        f"features rows have length {training.rows.shape[1]}, those before {width}: "
+                        f"features rows have length {training.rows.shape[1]}, earlier rows {width}: "
                         "start all processes with the same catstream and the same settings",
                         "width",
                     )
@@ -60,11 +60,12 @@ class Forest:
         continued: Mapping[str, Compressor] = MappingProxyType({}),
         after_object: Callable[[], object] = lambda: None,
     ) -> list[Sample]:
-        """Insert the features of one frame, calling `after_object` after each object; returns the samples that are due.
+        """Insert the features of one frame, calling `after_object` after each object; returns the new
+        samples.
 
-        A message that was processed before is ignored, by its `seq`. Objects that begin with a saved model have their
-        compressor in `continued`. ProtocolError if an earlier message is missing. The caller checks features that were
-        received from another process by `check_features`.
+        A message with an earlier `seq` is ignored. `continued` has the compressors of the objects that begin with a
+        saved model. ProtocolError if an earlier message is missing. Call `check_features` first for features from
+        another process.
         """
         if features.seq <= self.seq:
             return []
@@ -91,14 +92,14 @@ class Forest:
         return samples
 
     def skip_to(self, seq: int) -> None:
-        """Continue after message `seq`. The ones before it are lost: of a live source, after a power cut."""
+        """Continue after message `seq`. Earlier messages are lost, of a live source after a power failure."""
         if seq > self.seq:
             self.seq, self.frame = seq, seq - 1
 
     def states_at(self, seq: int | None) -> dict[str, DetectorState]:
-        """The detector states of the objects, by name, after message `seq`, or after the nearest one that is stored.
+        """The detector states of the objects, by name, after message `seq`, or after the nearest stored one.
 
-        Those after the newest message if `seq` is None.
+        `seq` None is the newest message.
         """
         if not self._states:
             return {}
@@ -159,8 +160,8 @@ class Forest:
     def load(cls, path: str | os.PathLike[str], settings: Settings) -> Forest:
         """Load a forest from a file of `save`.
 
-        ProtocolError if the file is damaged; ServiceError if it is not a checkpoint, or one of another version of
-        catstream; SettingsError if it was made with another coreset size.
+        ProtocolError if the file is damaged; ServiceError if it is not a checkpoint of this version of catstream;
+        SettingsError if it has another coreset size.
         """
         arrays, metadata = storage.read(path)
         _check_kind(path, metadata)

@@ -1,4 +1,4 @@
-"""A node of the coreset tree, the summary of consecutive rows; and a sample of several nodes.
+"""A node of the coreset tree, which summarises consecutive rows, and the sample of several nodes.
 
 The hierarchical sample has more rows of a node the higher its level is. The rows of a node are singular directions, not
 images: the sign of each is arbitrary, and all except the first have a mean near zero, so that a classifier cannot be
@@ -26,8 +26,8 @@ class Node:
 
     level   0 for a leaf, otherwise one more than the level of the two nodes that were merged; it summarises
             n * 2**level rows
-    rows    float32 (n, d): the original rows in a leaf, otherwise orthogonal rows, strongest direction first, of which
-            those after the first d are zero
+    rows    float32 (n, d): the original rows in a leaf, otherwise orthogonal rows, strongest direction first, and
+            zeros after the first d
     count   number of rows that it summarises
     sum     float64 (d,), exact sum of these rows
     energy  ||A||^2 of these rows
@@ -88,13 +88,13 @@ def sample(
 ) -> np.ndarray:
     """The first n w rows of every node, reflected and rescaled so that they have the weight of one original row.
 
-    The nodes are oldest first, with strictly decreasing levels. With the nodes and the rows of the last sample, the
-    rows of the nodes with which both begin are reused. Returns float32 (r, d), r <= 2n; (0, 0) without nodes.
+    The nodes are oldest first, with strictly decreasing levels. Given the nodes and the rows of the last sample, the
+    rows of the common first nodes are reused. Returns float32 (r, d), r <= 2n; (0, 0) without nodes.
     """
     if not nodes:
         return _EMPTY
     counts = [size >> (nodes[0].level - node.level) for node in nodes]  # n w with w = 2**(level - top), rounded down
-    # If the oldest node is the same, so are the counts of all nodes that are.
+    # The counts depend on the level of the oldest node: if it is unchanged, so are the rows of all unchanged nodes.
     same = sum(1 for _ in takewhile(lambda pair: pair[0] is pair[1], zip(nodes, last_nodes, strict=False)))
     reused = last_rows[: sum(counts[:same])]
     if same == len(nodes):

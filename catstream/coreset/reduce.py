@@ -50,11 +50,11 @@ def reduce(
     size : number of rows of the result (n in the paper), at least 1
     towards : float (d,), a vector whose products with the rows of the result are not negative, because the sign of a
         singular vector is arbitrary; None: the sum of the rows
-    gram : `products` of the rows, if they were computed before
+    gram : `products` of the rows, if already computed
 
     Returns
     -------
-    float32 (min(size, m), d), strongest first, orthogonal to one another; those after the first d are zero
+    float32 (min(size, m), d), strongest first, orthogonal to one another; zeros after the first d
 
     >>> reduce(np.ones((6, 4), np.float32), size=2).shape
     (2, 4)
@@ -97,7 +97,7 @@ def _strongest(
 
     gram = products(rows) if gram is None else gram
     if not _SQUARES[0] < gram.diagonal().max() < _SQUARES[1] and (peak := np.abs(rows).max()) > 0:
-        # In another unit: a power of two changes no digit. The energies stay in it, as they are only compared.
+        # Scaling by a power of two is exact. The energies stay scaled, because they are only compared.
         exponent = np.frexp(peak)[1]
         energies, strongest = _strongest(np.ldexp(rows, -exponent), count, np.ldexp(target, -exponent), None)
         return energies, np.ldexp(strongest, exponent)
@@ -105,7 +105,7 @@ def _strongest(
     energies, vectors, failed = ssyevd(gram, lower=1)
     if failed:
         raise np.linalg.LinAlgError(f"the eigenvectors of the Gram matrix of {len(rows)} rows did not converge")
-    # The rows of A are weighted by row i of `strongest`, and their sum is s_i v_i.
+    # The sum of the rows of A, weighted by row i of `strongest`, is s_i v_i.
     strongest = vectors.T[: -count - 1 : -1].copy()
     with np.errstate(invalid="ignore"):  # OpenBLAS may set the flag for memory beyond the rows
         strongest[strongest @ (rows @ target) < 0] *= -1
@@ -113,7 +113,7 @@ def _strongest(
 
 
 def _strongest_of_short_rows(rows: Float32, count: int, target: Float32) -> tuple[Float64, Float32]:
-    """The same from A'A, d x d, in float64; zeros follow the d strongest."""
+    """The result of `_strongest` from A'A, d x d, in float64; zeros follow the d strongest."""
     from scipy.linalg.blas import dsyrk
     from scipy.linalg.lapack import dsyevd
 

@@ -110,7 +110,7 @@ class CoresetTree:
 
     def extend(self, rows: np.ndarray) -> None:
         """Add rows as `insert` does, without its checks: the rows of a message were checked at reception."""
-        # Once for all leaves, and not for rows that complete none: the limit costs as much as inserting some rows.
+        # Limit the threads once for all leaves, and only if a leaf is completed: a limit costs as much as some rows.
         with one_thread() if self._filled + len(rows) >= self.size else nullcontext():
             while len(rows):
                 count = min(len(rows), self.size - self._filled)
@@ -129,7 +129,7 @@ class CoresetTree:
 
     @one_thread()
     def merged(self, other: CoresetTree) -> Self:
-        """A new tree of both streams, with the bound of one tree into which all rows were inserted."""
+        """A new tree of both streams; the bound holds as if all rows had been inserted into one tree."""
         if type(other) is not type(self):
             raise ProtocolError(
                 f"a {type(self).__name__} cannot merge a {type(other).__name__}: build both as {type(self).__name__}"
@@ -179,7 +179,7 @@ class CoresetTree:
 
     @classmethod
     def from_state(cls, arrays: Arrays, metadata: Metadata) -> Self:
-        """Restore a tree of this class from its `state`; ProtocolError if it is something else."""
+        """Restore a tree of this class from its `state`; ProtocolError if the state is invalid."""
         try:
             tree = cls(int(metadata["size"]))
             for i, node in enumerate(metadata["nodes"]):
@@ -194,7 +194,7 @@ class CoresetTree:
 
     def _append(self, rows: np.ndarray) -> None:
         """Add rows to the next leaf, which has room for them."""
-        if not self._filled:  # a node owns the previous array
+        if not self._filled:  # the previous array belongs to a node
             self._leaf = np.empty((self.size, rows.shape[1]), np.float32)
         elif self._filled == len(self._leaf):  # the pending rows of a loaded or copied tree
             self._leaf = np.vstack([self._leaf, np.empty((self.size - self._filled, rows.shape[1]), np.float32)])
@@ -283,7 +283,7 @@ def pack_trees(trees: Mapping[str, CoresetTree]) -> tuple[Arrays, Metadata]:
 
 
 def unpack_trees(arrays: Arrays, metadata: Metadata) -> dict[str, CoresetTree]:
-    """Restore trees that `pack_trees` packed; ProtocolError if it is something else."""
+    """Restore trees that `pack_trees` packed; ProtocolError if they are invalid."""
     return {
         name: CoresetTree.from_state(storage.with_prefix(arrays, f"{name}."), state) for name, state in metadata.items()
     }

@@ -1,4 +1,4 @@
-"""`FrameContext`: a frame, and the model and settings with which its windows are scored."""
+"""`FrameContext`: a frame, with the model and the settings that score its windows."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from catstream.wire.messages import Model
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameContext:
-    """A frame in which one object is searched.
+    """A frame in which one object is searched for.
 
     pyramid   the frame
     model     of the object
@@ -35,5 +35,5 @@ class FrameContext:
         return ScoreMap.within(self.pyramid, region, window, self.model)
 
     def scores_of_frame(self, window: Window) -> ScoreMap:
-        """The same in the frame, or in as large a part around the window as can be searched in time."""
+        """Scores of all windows of a size in the frame; if it is large, in the region around the window."""
         return self.scores_within(self.pyramid.region_around(window), window)

@@ -1,6 +1,7 @@
 """The detector of one object: frames in, tracks and training rows out (paper, "Classification").
 
-It holds the state and the model between frames: the same state, frame, model and settings give the same result.
+The state and the model are all that is kept between frames: with the same settings, they and a frame determine the
+result.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ if TYPE_CHECKING:
 Result = tuple[Track, ObjectFeatures]
 
 _STILL_INTERVAL = 7  # frames from one training frame of a still scene to the next; odd, as other intervals are even
-_EXPLAINED = 0.9  # score from which the model explains a frame; the mean of the object has the score 1
+_EXPLAINED = 0.9  # minimum score of a frame that need not be trained on; the mean of the object has the score 1
 _FIRST_FRAMES = 50  # frames of an object that are all used for training
 
 
@@ -46,7 +47,7 @@ class Detector:
     state           after the last frame; None before there is an object. Together with the model (and SCM, if in use)
                     it is all that the next frame depends on
     model           with which the next frame is searched
-    newest_version  of the models that arrived, whether they are in use or not
+    newest_version  of the received models, even if it is not in use
     similarity      to the object of a saved model, until its first detection; None without a saved model
     """
 
@@ -100,13 +101,13 @@ class Detector:
         self.newest_version = max(self.newest_version, model.version)
 
     def search(self, frame: Pyramid, seq: int) -> Detection:
-        """Search the object in the next frame. The state then has the predicted window.
+        """Search for the object in the next frame. The state then has the predicted window.
 
         Costs the same for every frame: a few small patches around the object, and the whole frame while the belief is
         low (or always, if `search.mode` is "full"), or until the first detection of a saved model's object.
         """
         if self._scm is not None:
-            score, box = self._scm.follow(frame.image)
+            score, box = self._scm.track(frame.image)
             return Detection(score, Window.around(box).with_centre_in(*frame.size))
         context = self._context(frame, seq)
         self.state = belief.predict_window(self._current_state())
@@ -154,11 +155,11 @@ class Detector:
         # One frame of each block trains, and in the next block the one after it, because other intervals are even. The
         # checksum of the name distributes several objects over the frames of a block.
         block, position = divmod(seq + crc32(self.name.encode()), self.settings.training.interval)
-        is_due = position == block % self.settings.training.interval
-        return detection.score >= _EXPLAINED and not is_due
+        is_selected = position == block % self.settings.training.interval
+        return detection.score >= _EXPLAINED and not is_selected
 
     def _is_still(self, detection: Detection, seq: int) -> bool:
-        """Return True if the surroundings of the object are as in a recent training frame (docs/paper.md)."""
+        """Return True if the region around the object is unchanged since a recent training frame (docs/paper.md)."""
         if detection.around is None or self._last_training is None or not self.model.version:
             return False
         number, cells = self._last_training
@@ -186,7 +187,7 @@ class Detector:
         return self._result(seq, time, score, teacher.training_at(context, window))
 
     def adopt(self, model: Model) -> None:
-        """Use a model from now on, unless it is older than the newest that arrived, or of a previous object."""
+        """Use a model from now on, unless it is older than the newest one, or belongs to a previous object."""
         if model.version <= self.newest_version:
             return
         self.newest_version = model.version
@@ -196,9 +197,9 @@ class Detector:
                 self.state = replace(self.state, motion=model.motion)
 
     def resume(self, state: DetectorState, model: Model) -> None:
-        """Continue a stream that another detector began, with its state after a frame and the newest model.
+        """Continue from the state of another detector after a frame, with the newest model.
 
-        With the model that the other one had by then, the results are the same, bit for bit.
+        With the model that the other detector had in that frame, the results are the same, bit for bit.
         """
         self.model, self.newest_version = model, model.version
         self.state = state if model.motion is None else replace(state, motion=model.motion)
@@ -209,7 +210,7 @@ class Detector:
         return self.state
 
     def _result(self, seq: int, time: float, score: float, training: Training) -> Result:
-        """The track and the features of a frame; no box is reported if the level of belief forbids it."""
+        """The track and the features of a frame; the level of belief decides whether a box is reported."""
         state, version = self._current_state(), self.model.version
         reported = self._policy(state).report
         box = state.window.box() if reported else None

@@ -16,23 +16,23 @@ from catstream.base.box import Window
 from catstream.base.settings import ExtentSettings
 
 _SIZE_STEP, _ASPECT_STEP = 0.04, 0.08  # relative change from one size or aspect ratio to the next
-#: The same as a difference of logarithms.
+#: The same changes as differences of logarithms.
 SIZE_CHANGE, ASPECT_CHANGE = math.log(1 + _SIZE_STEP), math.log(1 + _ASPECT_STEP)
 
-#: Steps of aspect ratio, either way, that a search may try: it changes slowly, and a fifth of a change is applied.
+#: Number of wider and of narrower aspect ratios that a search may try; few, because a fifth of a change is applied.
 ASPECT_STEPS = 2
 _PRIOR = 0.5  # weight of (log f)^2, for a size or an aspect ratio of f times the first one; 0.3 tracks worse
 
-_SIZE_RATE, _ASPECT_RATE = 0.7, 0.2  # share of a change, as a logarithm, that is applied in one frame
+_SIZE_RATE, _ASPECT_RATE = 0.7, 0.2  # share of a logarithmic change that is applied in one frame
 _PENALTY = 0.3  # weight of |log f|, for a change by the factor f
 _LABEL_STEPS = 16  # steps between the labels 0 and 1 of the size and the aspect head
 _OFFSET_WEIGHT = 0.02  # weight of the squared error of a window, in steps
-_LARGE_OFFSET = 1.0  # steps from which this cost grows linearly
-_MAX_GROWTH = 1.18  # factor of size by which no object grows in a frame
+_LARGE_OFFSET = 1.0  # steps above which this cost grows linearly
+_MAX_GROWTH = 1.18  # larger than the growth of any object in a frame
 
 
 class Trial(NamedTuple):
-    """A window of a wrong extent, and the steps by which it is too large and too wide."""
+    """A window of a wrong extent, with the steps by which it is too large and too wide."""
 
     window: Window
     larger: int = 0
@@ -55,7 +55,7 @@ def smooth(before: Window, window: Window, *, resize: bool) -> Window:
 
 
 def trials(window: Window, settings: ExtentSettings) -> list[list[Trial]]:
-    """Windows of wrong sizes, then of wrong aspect ratios, as far as each is searched; none unless they are learned."""
+    """Windows of wrong sizes, then of wrong aspect ratios, over the searched ranges; empty unless they are learned."""
     if not settings.learned:
         return []
     sizes = [Trial(window.scaled(size(k)), larger=k) for k in _steps(settings.size_count // 2)]
@@ -92,9 +92,9 @@ def prior(settings: ExtentSettings) -> float:
     return _PRIOR if settings.learned else 0.0
 
 
-def _steps(most: int) -> list[int]:
-    """The steps of sizes or aspect ratios up to `most` either way, smallest or narrowest first, without 0."""
-    return [k for k in range(-most, most + 1) if k]
+def _steps(limit: int) -> list[int]:
+    """The steps of sizes or aspect ratios up to `limit` in both directions, smallest or narrowest first, without 0."""
+    return [k for k in range(-limit, limit + 1) if k]
 
 
 def size(step: float) -> float:

@@ -6,9 +6,9 @@ filter scores the particles by a product ("Collaborative Model"):
 - H, of an adaptive classifier of the whole template against the background: `_Discriminative`;
 - L, of a histogram of the object's patches, which detects occlusion: `_Generative`.
 
-Numbers and notation are theirs. There are three differences: the particles are spread in proportion to the size of the
-object, not in pixels; there is no shear, which a box cannot represent; and L is not computed for particles that cannot
-have the highest product, by their H.
+Parameters and notation are the authors', with three differences: the particles are spread in proportion to the size of
+the object, not in pixels; there is no shear, which a box cannot represent; and L is not computed for particles whose H
+excludes the highest product.
 """
 
 from __future__ import annotations
@@ -55,11 +55,11 @@ class SparseCollaborativeModel:
         self._frames = 1
         grey = _grey(image)
         template = self._cuts(grey, self._state[None])
-        positives = self._cuts(grey, self._beside(_POSITIVES, 0.0, 0.02))
+        positives = self._cuts(grey, self._shifted(_POSITIVES, 0.0, 0.02))
         self._discriminative = _Discriminative.trained(positives, self._background(grey))
         self._generative = _Generative.from_template(template[0], int(rng.integers(2**31)))
 
-    def follow(self, image: np.ndarray) -> tuple[float, Box]:
+    def track(self, image: np.ndarray) -> tuple[float, Box]:
         """Track the object in the next frame, of the size of the first one.
 
         Returns
@@ -102,9 +102,9 @@ class SparseCollaborativeModel:
 
     def _background(self, grey: Pyramid) -> np.ndarray:
         """Negative templates, from an annulus that includes the object's edge ("Templates")."""
-        return self._cuts(grey, self._beside(_NEGATIVES, 0.25, 0.5))
+        return self._cuts(grey, self._shifted(_NEGATIVES, 0.25, 0.5))
 
-    def _beside(self, count: int, min_shift: float, deviation: float) -> np.ndarray:
+    def _shifted(self, count: int, min_shift: float, deviation: float) -> np.ndarray:
         """States shifted from the current one by more than a share of the box along x or along y."""
         shifts = self._rng.normal(scale=deviation, size=(8 * count, 2))
         states = np.tile(self._state, (count, 1))
@@ -115,12 +115,12 @@ class SparseCollaborativeModel:
         """The patches of the frame at states, uint8 (count, 32, 32)."""
         across = self._first.w / _SIDE * np.exp(states[:, 2] + states[:, 3])
         down = self._first.h / _SIDE * np.exp(states[:, 2] - states[:, 3])
-        places = zip(states[:, 0], states[:, 1], across, down, states[:, 4], strict=True)
-        return np.array([grey.cut(x, y, w, h, _SIDE, turn)[0] for x, y, w, h, turn in places])
+        cuts = zip(states[:, 0], states[:, 1], across, down, states[:, 4], strict=True)
+        return np.array([grey.cut(x, y, w, h, _SIDE, angle)[0] for x, y, w, h, angle in cuts])
 
 
 class _Discriminative:
-    """The object's templates against the background's ("Sparsity-based Discriminative Classifier")."""
+    """A classifier of templates of object and background ("Sparsity-based Discriminative Classifier")."""
 
     _SELECTION = 0.001  # lambda of the regression
     _SIGMA = 0.4
@@ -183,7 +183,7 @@ class _Generative:
         return shares
 
     def update(self, patch: np.ndarray) -> None:
-        """Update the histogram, unless the object is occluded; the first one stays a part of it ("Update Scheme")."""
+        """Update the histogram unless the object is occluded; it retains a share of the first one ("Update Scheme")."""
         codes, is_occluded = self._coded(patch[None])
         if is_occluded.mean() < self._MAX_OCCLUSION:
             codes[is_occluded] = 0
@@ -222,8 +222,8 @@ def _unit(rows: np.ndarray) -> np.ndarray:
 def _codes(rows: np.ndarray, atoms: np.ndarray) -> np.ndarray:
     """Non-negative sparse codes: minimise |row - code atoms|^2 / 2 + lambda |code|_1.
 
-    `sklearn.decomposition.sparse_encode` computes the same, but needs a call of 0.2 ms for each of the 58,800 patches
-    of a frame; and patches are so similar that coordinate descent needs 500 sweeps.
+    `sklearn.decomposition.sparse_encode` computes the same, but a call takes 0.2 ms for each of the 58,800 patches of a
+    frame, and coordinate descent needs 500 sweeps for patches that are so similar.
 
     Returns
     -------

@@ -1,7 +1,7 @@
 """Similarity: how much of a window's appearance lies in the subspace of the object's earlier appearances.
 
-The score of a model separates the object from the background that it was trained on. In another scene, windows that
-are neither may score high. Distances to subspaces are what a coreset preserves, so they can be measured from it.
+The score of a model separates the object from the background that it was trained on. In another scene, unrelated
+windows may score high. Distances to subspaces are what a coreset preserves, so they can be measured from it.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ _DIRECTIONS = 12  # dimension of the subspace
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Similarity:
-    """The subspace of an object, and the share of the energy of its own rows that lies in it.
+    """The subspace of an object, with the share of the energy of its own rows that lies in the subspace.
 
     With the mean b of the background, the share of a row x is ||V (x - b)||^2 / ||x - b||^2. Its similarity is this
     share divided by the share of the object's own rows, so that one threshold holds for all objects.
@@ -35,7 +35,7 @@ class Similarity:
 
     @classmethod
     def of(cls, rows: np.ndarray, energy: float, total: np.ndarray, count: int, background: np.ndarray) -> Self:
-        """The subspace of rows A, of which a coreset is known. Costs one QR decomposition, O(r^2 d).
+        """Compute the subspace of rows A from their coreset. Costs one QR decomposition, O(r^2 d).
 
         Parameters
         ----------

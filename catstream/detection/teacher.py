@@ -1,6 +1,6 @@
 """The teacher: the windows of a frame that become training rows, and their labels.
 
-A row of the object has the label 1, a row of the background 0. Between them are near misses, which are windows beside
+A row of the object has the label 1, a row of the background 0. Between them are near misses, which are windows next to
 the object, and windows of the object of a wrong size or aspect ratio. Their label is a Gaussian of the offset, so that
 the score falls smoothly around the right window. Windows of wrong extents have a second label, the error of their size
 or aspect ratio. The initial model is trained on the rows of the first frame.
@@ -34,11 +34,11 @@ from catstream.wire.messages import Model, TrainingRows
 #: Training rows by group, as in `Features`; a group without rows is left out.
 Training = dict[str, TrainingRows]
 
-_NEAR_MISSES = 6  # windows beside the object in each frame; 12 gain nothing and cost time
+_NEAR_MISSES = 6  # in each frame; 12 gain nothing and cost time
 _NEAR = 2  # distance in cells up to which a window is a near miss, not background
-_MIN_DISTANCE = 0.9  # of a near miss, in cells: a nearer window shows the object as well as its own does
+_MIN_DISTANCE = 0.9  # of a near miss, in cells: a nearer window fits the object as well
 _NEAR_SIGMA = 0.9  # standard deviation of the Gaussian label of a near miss, in cells
-_EXTENT_SIGMA = 1.0  # the same of a window of a wrong extent, in steps of size or aspect ratio
+_EXTENT_SIGMA = 1.0  # for the label of a wrong extent, in steps of size or aspect ratio
 _EXTENT_INTERVAL = 2  # frames from one set of windows of wrong extents to the next
 _OBJECT_WEIGHT = 8.0  # sum of the weights of a frame's rows of the object; any other row has weight 1
 _BACKGROUND = 12  # background windows around the object in a frame
@@ -48,9 +48,13 @@ _MAX_CELLS = 4096  # limit of a search for hard negatives in one frame: about 4 
 _MAX_OVERLAP = 0.2  # IoU of a hard negative with the object's window
 
 _PATCH = (WINDOW + 2 * MARGIN) * CELL  # side of a copy with its margin, in pixels
-_SCALE, _SHIFT, _TURN = 0.03, 0.02, 0.05  # standard deviations of affine copies: a factor, a share of the box, radians
-_MIRRORED = 1  # of a frame's copies that are flipped, as an object that turns may look
-_MOVED = 0.9  # share of the first frame's copies on another background, which no model is to learn; 0.5 gains less
+_SCALE, _SHIFT, _ROTATION = (
+    0.03,
+    0.02,
+    0.05,
+)  # standard deviations of affine copies: a factor, a share of the box, radians
+_MIRRORED = 1  # number of a frame's copies that are flipped: a rotated object may look like its mirror image
+_MOVED = 0.9  # share of the first frame's copies on another background, so that models do not learn it; 0.5 gains less
 _MIN_OFFSET, _MAX_OFFSET = 0.3, 1.0  # distance of another background, in windows
 # Radii of the object's ellipse between which a copy fades into another background; 1 touches the sides of its box.
 _OPAQUE, _TRANSPARENT = 0.8, 1.15
@@ -59,7 +63,7 @@ _OPAQUE, _TRANSPARENT = 0.8, 1.15
 def first_training(
     frame: Pyramid, window: Window, rng: np.random.Generator, settings: Settings
 ) -> tuple[Model, Training]:
-    """Train the initial model, on the rows of the first frame, which fill a leaf of each tree; returns both.
+    """Train the initial model on the rows of the first frame, which fill a leaf of each tree; returns both.
 
     If SCM tracks the object first, the group "appearance" has only the rows of an ordinary frame. BoxError if object
     and background are indistinguishable.
@@ -82,8 +86,8 @@ def training_of(context: FrameContext, window: Window, around: ScoreMap | None) 
     """The rows of a frame in which the object was detected, cut around its window.
 
     Windows of wrong extents are cut in every second frame. Hard negatives are searched in a part of the frame at a
-    time. The parts have equal shares of the rows, so that the number of rows over many frames does not depend on that
-    of the parts.
+    time. The parts have equal shares of the rows, so the number of rows over many frames does not depend on the
+    number of parts.
     """
     training = training_at(context, window, around, extents=context.seq % _EXTENT_INTERVAL == 0)
     options = context.settings.training
@@ -91,7 +95,7 @@ def training_of(context: FrameContext, window: Window, around: ScoreMap | None) 
     number = due_part(context.seq, _MINING_INTERVAL, len(parts))
     if number is None:
         return training
-    # A round of all parts has hard_negatives / _MINING_INTERVAL rows for every frame that it takes.
+    # A round of all parts yields hard_negatives / _MINING_INTERVAL rows per frame on average.
     rows = options.hard_negatives * max(len(parts), _MINING_INTERVAL)
     shares = len(parts) * _MINING_INTERVAL
     if count := (number + 1) * rows // shares - number * rows // shares:
@@ -108,7 +112,7 @@ def training_at(
     Near misses and background are cut from the windows `around` it, if a search scored enough of them.
     """
     settings = context.settings
-    rng = np.random.default_rng((settings.run.seed, context.seq))  # of this frame alone, so that a restart repeats it
+    rng = np.random.default_rng((settings.run.seed, context.seq))  # per frame, so that a restart repeats the rows
     if around is None or min(around.cells.shape) < _SIDE:
         around = context.scores_around(window, _SIDE)
     rows = _appearance(context.pyramid, window, around, rng, settings.training, hardest=_BACKGROUND // 2)
@@ -121,7 +125,7 @@ def training_at(
 def training_of_background(context: FrameContext, window: Window, similarity: Similarity) -> Training:
     """The rows of a frame before the first detection of a saved model's object: background of a new scene.
 
-    They are windows with a high score, except the best one, which may be the object, and those similar to the object.
+    They are windows with a high score, except windows similar to the object, and the best one, which may be the object.
     """
     settings = context.settings
     scores = context.scores_of_frame(window)
@@ -141,9 +145,8 @@ def _hardest(scores: ScoreMap, window: Window, count: int, threshold: float = -m
 
     They are selected by non-maximum suppression, and hardly overlap `window`.
     """
-    places = non_maximum_suppression(scores.scores, count + 1, WINDOW // 2, threshold)
-    places = [place for place in places if scores.window(*place).overlap(window) < _MAX_OVERLAP][:count]
-    return scores.cells.rows(places)
+    maxima = non_maximum_suppression(scores.scores, count + 1, WINDOW // 2, threshold)
+    return scores.cells.rows([cell for cell in maxima if scores.window(*cell).overlap(window) < _MAX_OVERLAP][:count])
 
 
 def initial_model(rows: TrainingRows) -> Model:
@@ -175,19 +178,18 @@ def affine_copies(
 ) -> np.ndarray:
     """Features of a window and of affine copies: slightly scaled, shifted, rotated (paper, "System Implementation").
 
-    All copies of a frame have the same background in the corners of the window, which is not the object: the share
-    `moved` of the copies is put on another background of the frame. An object that turns shows another side, which is
-    often the mirror image: the last `mirrored` copies are flipped left to right. Returns float32 (count, d); the first
-    row is the window itself.
+    The corners of the window show background, the same in all copies: a share `moved` of the copies is put on another
+    background of the frame. The other side of an object is often its mirror image: the last `mirrored` copies are
+    flipped left to right. Returns float32 (count, d); the first row is the window itself.
     """
     changes = rng.normal(size=(count, 4))
     if count:
         changes[0] = 0
     patches = []
-    for number, (scale, right, down, turn) in enumerate(changes):
+    for number, (scale, right, down, angle) in enumerate(changes):
         copy = _shifted(window, right, down).scaled(math.exp(_SCALE * scale))
         offset = _random_offset(window, rng) if _is_moved(number, moved) else None
-        patch = _patch(frame, copy, _TURN * turn, copy.box(), offset)
+        patch = _patch(frame, copy, _ROTATION * angle, copy.box(), offset)
         patches.append(patch[:, :, ::-1] if number >= max(count - mirrored, 1) else patch)
     return window_rows(patches)
 
@@ -211,20 +213,20 @@ def _random_offset(window: Window, rng: np.random.Generator) -> tuple[float, flo
 
 
 def _patch(
-    frame: Pyramid, window: Window, turn: float, box: Box, offset: tuple[float, float] | None = None
+    frame: Pyramid, window: Window, angle: float, box: Box, offset: tuple[float, float] | None = None
 ) -> np.ndarray:
-    """Cut a window and its margin from a frame, rotate them by `turn` radians and resize them to uint8 (3, 96, 96).
+    """Cut a window and its margin from a frame, rotate them by `angle` radians and resize them to uint8 (3, 96, 96).
 
-    With an offset, the object, whose box has the centre of the window, is blended into the background that many pixels
-    away.
+    With an offset in pixels, the object, whose box has the centre of the window, is blended into the background at that
+    offset.
     """
     pixel = window.w / (WINDOW * CELL), window.h / (WINDOW * CELL)
     x, y = window.centre
-    patch = frame.cut(x, y, *pixel, _PATCH, turn)
+    patch = frame.cut(x, y, *pixel, _PATCH, angle)
     if offset is None:
         return patch
     share = _share(window.h / box.h, window.w / box.w)
-    background = frame.cut(x + offset[0], y + offset[1], *pixel, _PATCH, turn)
+    background = frame.cut(x + offset[0], y + offset[1], *pixel, _PATCH, angle)
     channels = zip(patch, background, strict=True)
     return np.stack([cv2.blendLinear(*pair, share, 1 - share) for pair in channels])
 
@@ -257,23 +259,23 @@ def _surroundings(
     around: ScoreMap, window: Window, count: int, hardest: int, rng: np.random.Generator, options: TrainingSettings
 ) -> TrainingRows:
     """Near misses of a window, and `count` background windows: those with the highest scores, and random ones."""
-    row, column = around.place(window)
+    row, column = around.position(window)
     rows, columns = around.scores.shape
     down = abs(np.arange(rows) - row)
     across = abs(np.arange(columns) - column)
     is_background = np.maximum.outer(down, across) > _NEAR + 0.5
     near, far = np.flatnonzero(~is_background), np.flatnonzero(is_background)  # indices of windows, row by row
-    places, labels = [], []
+    near_misses, labels = [], []
     for index in near[rng.integers(len(near), size=_NEAR_MISSES)] if len(near) else ():
-        place = divmod(int(index), columns)
-        distance = math.hypot(down[place[0]], across[place[1]])
+        cell = divmod(int(index), columns)
+        distance = math.hypot(down[cell[0]], across[cell[1]])
         if distance > _MIN_DISTANCE:
-            places.append(place)
+            near_misses.append(cell)
             labels.append(_gaussian(distance, _NEAR_SIGMA))
     hard = non_maximum_suppression(np.where(is_background, around.scores, -np.inf), hardest, _NEAR)
     random = rng.choice(far, count - len(hard), replace=count > len(far))
     background = [*hard, *(divmod(int(index), columns) for index in random)]
-    return _rows(around.cells.rows([*places, *background]), [*labels, *[0.0] * len(background)], 1, options)
+    return _rows(around.cells.rows([*near_misses, *background]), [*labels, *[0.0] * len(background)], 1, options)
 
 
 def _extents(frame: Pyramid, window: Window, rows: TrainingRows, settings: Settings) -> Training:
@@ -286,7 +288,7 @@ def _extents(frame: Pyramid, window: Window, rows: TrainingRows, settings: Setti
 
 
 def _first_extents(frame: Pyramid, window: Window, rng: np.random.Generator, settings: Settings) -> Training:
-    """Rows of the same group from the first frame, more than fill a leaf, because only there the box is certain.
+    """Rows of group "extent" from the first frame, enough to fill a leaf, because only there the box is certain.
 
     The windows are cut from shifted and rotated copies of the object, most of which are on another background.
     """
@@ -295,12 +297,12 @@ def _first_extents(frame: Pyramid, window: Window, rng: np.random.Generator, set
     trials, patches = [], []
     for kind in kinds:
         for number in range(math.ceil(settings.coreset.size / (1 + len(kind)))):
-            right, down, turn = rng.normal(size=3) if number else np.zeros(3)
+            right, down, angle = rng.normal(size=3) if number else np.zeros(3)
             copy = _shifted(window, right, down)
             offset = _random_offset(window, rng) if _is_moved(number, moved) else None
             for trial in (extent.Trial(window), *kind):
                 trials.append(trial)
-                patches.append(_patch(frame, trial.window.centred(*copy.centre), _TURN * turn, copy.box(), offset))
+                patches.append(_patch(frame, trial.window.centred(*copy.centre), _ROTATION * angle, copy.box(), offset))
     return {EXTENT: _fits(trials, window_rows(patches), 1 / len(kinds), settings.training)} if kinds else {}
 
 

@@ -1,4 +1,4 @@
-"""Cells: the features of an image in a grid of cells, and the score of every window in it.
+"""The features of an image in a grid of cells, and the score of every window in it.
 
 Each cell of 8 x 8 pixels has 31 HOG channels (18 signed and 9 unsigned orientations, 4 texture energies; Felzenszwalb
 et al. 2010), of the colour channel with the strongest gradient, then its mean colour in Lab. A window is 8 x 8 cells.
@@ -25,7 +25,7 @@ _MEAN_COLOUR = slice(CHANNELS - 3, CHANNELS)
 #: Limits of a change by the noise of a camera: of a mean colour (9 levels of lightness, 3 of a and b) in all cells but
 #: one in a hundred, and of the squares of all features. Noise of 2 levels in the pixels changes 6 levels and 0.08.
 _NOISE_OF_COLOUR, _CHANGED, _NOISE = 9 * 1.5 / 255, 0.01, 0.1
-_LOWEST = float(np.finfo(np.float32).min)  # the kernels do not compute with infinity
+_LOWEST = float(np.finfo(np.float32).min)  # the fast arithmetic of the kernels excludes infinity
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -74,11 +74,11 @@ class Cells:
         features: np.ndarray = self.rows([(row, column)])[0]
         return features
 
-    def rows(self, places: Sequence[tuple[int, int]]) -> np.ndarray:
+    def rows(self, corners: Sequence[tuple[int, int]]) -> np.ndarray:
         """Feature rows of the windows whose first cells are at (row, column), float32 (k, d)."""
-        features = np.empty((len(places), ROW_LENGTH), np.float32)
+        features = np.empty((len(corners), ROW_LENGTH), np.float32)
         lines = self.grid.reshape(len(self.grid), -1)
-        kernels.cut_rows(lines, self.shades, np.array(places, np.int64).reshape(-1, 2), features)
+        kernels.cut_rows(lines, self.shades, np.array(corners, np.int64).reshape(-1, 2), features)
         return features
 
     def respond(self, weights: np.ndarray, bias: float) -> np.ndarray:
@@ -88,16 +88,16 @@ class Cells:
         return scores
 
     def respond_above(self, weights: np.ndarray, bias: float, threshold: float) -> np.ndarray:
-        """The same scores, with -inf for every window whose score is below a threshold.
+        """The scores of `respond`, with -inf for every window whose score is below a threshold.
 
-        The colours of a window are not counted if its score would be below the threshold with any histogram of colours:
-        this takes three quarters of the time of `respond` if few windows score that high.
+        The colours of a window are only counted if some histogram could raise its score to the threshold: this takes
+        three quarters of the time of `respond` if few windows score that high.
         """
         colour_threshold = threshold - highest_colour_score(weights[COLOURS])
         scores = self._cell_scores(weights, bias)
-        hopeless = scores < colour_threshold
+        is_low = scores < colour_threshold
         kernels.add_colour_scores(self.shades, _writable(weights[COLOURS]), colour_threshold, scores)
-        scores[hopeless | (scores < threshold)] = -np.inf
+        scores[is_low | (scores < threshold)] = -np.inf
         return scores
 
     def _cell_scores(self, weights: np.ndarray, bias: float) -> np.ndarray:
@@ -121,13 +121,13 @@ def window_rows(patches: Sequence[np.ndarray]) -> np.ndarray:
 def grid(planes: np.ndarray, margin: int = 0) -> np.ndarray:
     """HOG and mean colour of every whole cell of an image.
 
-    A cell's features depend on pixels up to `MARGIN` cells away: the grid of a crop equals the slice of the frame's
-    grid, but for that margin.
+    A cell's features depend on pixels up to `MARGIN` cells away: without that margin, the grid of a crop equals the
+    slice of the frame's grid.
 
     Parameters
     ----------
     planes : uint8 (3, h, w), blue, green and red of the image
-    margin : cells along each edge that are left out
+    margin : number of cells along each edge to omit
 
     Returns
     -------
@@ -144,7 +144,7 @@ def grid(planes: np.ndarray, margin: int = 0) -> np.ndarray:
 
 
 def _shares() -> np.ndarray:
-    """Weights of bilinear interpolation between four cells, of the pixels between their centres, float32 (8, 8, 4)."""
+    """Weights of the bilinear interpolation of a pixel between four cell centres, float32 (8, 8, 4)."""
     far = (np.arange(CELL) + 0.5) / CELL
     near = 1 - far
     shares = [np.outer(down, across) for down in (near, far) for across in (near, far)]
@@ -202,5 +202,5 @@ _SHADES_OF = _shade_table()
 
 
 def _writable(array: np.ndarray) -> np.ndarray:
-    """The array, or a copy if it is read-only, like weights that arrived over the wire: the kernels reject those."""
+    """The array, or a copy if it is read-only, as arrays of messages are: kernels reject read-only arrays."""
     return array if array.flags.writeable else array.copy()

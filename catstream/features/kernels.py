@@ -17,7 +17,7 @@ from catstream.features.compilation import function, kernel
 _OPTIONS: dict[str, Any] = {"nogil": True, "fastmath": True, "error_model": "numpy"}
 
 CELL, WINDOW, CHANNELS, SIDE = 8, 8, 34, 4  # as in layout.py
-_PLACES = WINDOW * WINDOW * CHANNELS  # features of the cells of a window, before those of its colours
+_CELL_FEATURES = WINDOW * WINDOW * CHANNELS  # in a row, before the histogram of colours
 _ORIENTATIONS = 9
 _SIGNED = 2 * _ORIENTATIONS
 _HALF = CELL // 2
@@ -27,10 +27,10 @@ _COLOUR_WEIGHT = 1.5
 _LIGHT_SCALE = float32(_COLOUR_WEIGHT / 255)
 _CHROMA_SCALE = float32(3) * _LIGHT_SCALE
 _LAB_MIDDLE = 128
-#: Orientations are 20 degrees apart: the tangents of where one ends and the next begins, from 0 to 90.
+#: Tangents of the limits between orientations, which are 20 degrees apart, from 0 to 90.
 _TAN_10, _TAN_30, _TAN_50, _TAN_70 = np.tan(np.deg2rad([10, 30, 50, 70])).astype(np.float32)
 
-COLOUR_LENGTH = 3.0  #: length of a histogram of colours as features; that of a window's HOG is about 9
+COLOUR_LENGTH = 3.0  #: norm of the histogram of colours in a row; the norm of a window's HOG is about 9
 COUNTED = WINDOW - 2  #: cells along a side of the middle of a window, whose shades are counted
 _ROOT = float32(COLOUR_LENGTH / (COUNTED * SIDE))  # factor of the root of a count, as a feature
 
@@ -75,10 +75,10 @@ def _lab(blue: int, green: int, red: int) -> tuple[int, int, int]:
 
 @kernel("void(uint8[:,::1], uint8[:,::1])", **_OPTIONS)
 def convert_to_lab(colours: UInt8, lab: UInt8) -> None:
-    """Lab of colours, (k, 3): blue, green, red to lightness, a, b, as OpenCV's `COLOR_BGR2LAB` converts them.
+    """Convert colours, (k, 3), from blue, green, red to lightness, a, b, like OpenCV's `COLOR_BGR2LAB`.
 
-    OpenCV makes tables first, for 90 ms in each process, which differ in a few entries between processors. The tables
-    here do not: a few colours in ten thousand differ by one level.
+    OpenCV first computes tables, for 90 ms in each process, which differ in a few entries between processors. The
+    tables here are constant; a few colours in ten thousand differ from OpenCV's by one level.
     """
     for k in range(len(colours)):
         lab[k, 0], lab[k, 1], lab[k, 2] = _lab(colours[k, 0], colours[k, 1], colours[k, 2])
@@ -86,7 +86,7 @@ def convert_to_lab(colours: UInt8, lab: UInt8) -> None:
 
 @function(**_OPTIONS)
 def _read(planes: UInt8, y: int, line: Float32) -> None:
-    """The three channels of one row of pixels, the pixels at the edge twice."""
+    """Read the three channels of a row of pixels, and duplicate the pixels at both ends."""
     width = line.shape[1] - 2
     for channel in range(3):
         values, row = line[channel], planes[channel, y]
@@ -120,7 +120,7 @@ def _gradients(
 
 @function(**_OPTIONS)
 def _orientations(across: Float32, down: Float32, orientation: UInt8) -> None:
-    """Which of 18 directions, 0 ... 17, each gradient points to."""
+    """Quantise the direction of each gradient to 0 ... 17."""
     for x in range(len(orientation)):
         dx, dy = across[x], down[x]
         flat, steep = abs(dx), abs(dy)
@@ -133,8 +133,8 @@ def _orientations(across: Float32, down: Float32, orientation: UInt8) -> None:
 
 @function(**_OPTIONS)
 def _add(magnitude: Float32, orientation: UInt8, shares: Float32, blocks: Float32) -> None:
-    """Add a line's pixels to the four shares of their orientation in the block of 8 x 8 pixels that they lie in."""
-    for i in range(CELL):  # not block by block: to add to what was just added to is slow
+    """Add the pixels of a line to the bins of their orientations, interpolated between the four cells of a block."""
+    for i in range(CELL):  # not block by block: successive additions to one bin are slow
         above_left, above_right, below_left, below_right = shares[i, 0], shares[i, 1], shares[i, 2], shares[i, 3]
         for block in range(blocks.shape[0]):
             strength = magnitude[block * CELL + i]
@@ -146,14 +146,14 @@ def _add(magnitude: Float32, orientation: UInt8, shares: Float32, blocks: Float3
 
 @function(**_OPTIONS)
 def _count(planes: UInt8, margin: int, shares: Float32, histogram: Float32) -> None:
-    """Histograms of the cells within a margin."""
+    """Compute the histograms of the cells within a margin."""
     rows, columns = histogram.shape[0] - 2, histogram.shape[1] - 2
     height, width = rows * CELL, columns * CELL
-    lines = np.empty((3, 3, width + 2), np.float32)  # the channels of the rows above, here and below, in turns
+    lines = np.empty((3, 3, width + 2), np.float32)  # channels of three successive rows, in rotation
     across, down = np.empty(width, np.float32), np.empty(width, np.float32)
-    magnitude = np.empty(width + CELL, np.float32)  # with half a cell more on either side
+    magnitude = np.empty(width + CELL, np.float32)  # with half a cell of padding on either side
     orientation = np.empty(width + CELL, np.uint8)
-    blocks = np.empty((columns + 1, _SIGNED, 4), np.float32)  # of the pixels between the centres of four cells
+    blocks = np.empty((columns + 1, _SIGNED, 4), np.float32)  # each spans the centres of four cells
     inner = slice(margin * CELL, (columns + 1 - margin) * CELL)
     for x in range(len(magnitude)):
         magnitude[x] = orientation[x] = 0
@@ -161,7 +161,7 @@ def _count(planes: UInt8, margin: int, shares: Float32, histogram: Float32) -> N
         for column in range(columns + 2):
             for o in range(_SIGNED):
                 histogram[row, column, o] = 0
-    for band in range(margin, rows + 1 - margin):  # of the pixels between the centres of two rows of cells
+    for band in range(margin, rows + 1 - margin):  # from the centres of one row of cells to the next
         for block in range(margin, columns + 1 - margin):
             for o in range(_SIGNED):
                 for share in range(4):
@@ -188,7 +188,7 @@ def _count(planes: UInt8, margin: int, shares: Float32, histogram: Float32) -> N
 @function(**_OPTIONS)
 def _average(plane: UInt8, row: int, column: int) -> int:
     """The mean of one channel of a cell's pixels."""
-    total = float32(CELL * CELL // 2)  # half, to round; floats are added eight at once
+    total = float32(CELL * CELL // 2)  # half, to round; floats are added eight at a time
     for y in range(row * CELL, (row + 1) * CELL):
         for x in range(column * CELL, (column + 1) * CELL):
             total += float32(plane[y, x])
@@ -210,7 +210,7 @@ def _colour(planes: UInt8, margin: int, cells: Float32) -> None:
 
 @function(**_OPTIONS)
 def _normalise(histogram: Float32, margin: int, cells: Float32) -> None:
-    """Each cell's histogram by the energies of the four blocks of 2 x 2 cells that it is in."""
+    """Normalise the histogram of each cell by the energies of the four blocks of 2 x 2 cells around it."""
     rows, columns = histogram.shape[0] - 2, histogram.shape[1] - 2
     energy = np.empty((rows, columns), np.float32)
     for row in range(rows):
@@ -258,11 +258,11 @@ def _normalise(histogram: Float32, margin: int, cells: Float32) -> None:
 def describe_cells(planes: UInt8, margin: int, shares: Float32, cells: Float32) -> None:
     """HOG and mean colour of the cells within the margin.
 
-    It goes line by line: what a line's pixels do is written so that the compiler does eight of them at once. Only
-    counting them is one by one, but each pixel is added to its four nearest cells at once.
+    The loops over the pixels of a line are vectorised by the compiler, eight pixels at a time, except the update of the
+    histograms, which adds a pixel to its four nearest cells at a time.
     """
     rows, columns = cells.shape[0] + 2 * margin, cells.shape[1] + 2 * margin
-    histogram = np.empty((rows + 2, columns + 2, _SIGNED), np.float32)  # one more on every side: what falls outside
+    histogram = np.empty((rows + 2, columns + 2, _SIGNED), np.float32)  # with a border for shares outside of the image
     _count(planes, max(margin - 1, 0), shares, histogram)
     _normalise(histogram, margin, cells)
     _colour(planes, margin, cells)
@@ -273,13 +273,13 @@ def look_up_shades(planes: UInt8, table: UInt16, shades: UInt16) -> None:
     """The shade of every 2 x 2 pixels of the planes blue, green and red, by a table of BGR colours of 5 bits each."""
     for y in range(shades.shape[0]):
         for x in range(shades.shape[1]):
-            place = 0  # the first 5 bits of each channel's mean, one after the other
+            index = 0  # the upper 5 bits of the mean of each channel, concatenated
             for channel in range(3):
                 above = np.int64(planes[channel, 2 * y, 2 * x]) + planes[channel, 2 * y, 2 * x + 1]
                 below = np.int64(planes[channel, 2 * y + 1, 2 * x]) + planes[channel, 2 * y + 1, 2 * x + 1]
                 mean = (above + below + 2) >> 2
-                place = place << 5 | mean >> 3
-            shades[y, x] = table[place]
+                index = index << 5 | mean >> 3
+            shades[y, x] = table[index]
 
 
 @function(**_OPTIONS)
@@ -335,21 +335,21 @@ def add_colour_scores(shades: UInt16, weights: Float32, threshold: float, scores
 
 
 @kernel("void(float32[:,::1], uint16[:,::1], int64[:,::1], float32[:,::1])", **_OPTIONS)
-def cut_rows(grid: Float32, shades: UInt16, places: Int64, features: Float32) -> None:
-    """Feature rows of the windows whose first cells are at `places`."""
-    for k in range(len(places)):
-        row, column = places[k, 0], places[k, 1]
+def cut_rows(grid: Float32, shades: UInt16, corners: Int64, features: Float32) -> None:
+    """Feature rows of the windows whose first cells are `corners`."""
+    for k in range(len(corners)):
+        row, column = corners[k, 0], corners[k, 1]
         for i in range(WINDOW):
             cells = grid[row + i, column * CHANNELS : (column + WINDOW) * CHANNELS]
             line = features[k, i * WINDOW * CHANNELS : (i + 1) * WINDOW * CHANNELS]
             for j in range(WINDOW * CHANNELS):
                 line[j] = cells[j]
-        _count_shades(shades, row, column, features[k, _PLACES:])
+        _count_shades(shades, row, column, features[k, _CELL_FEATURES:])
 
 
 @kernel("void(uint8[:,:,:,::1], int64, float32[:,:,::1], uint16[::1], float32[:,::1])", **_OPTIONS)
 def describe_windows(patches: UInt8, margin: int, shares: Float32, table: UInt16, features: Float32) -> None:
-    """Feature rows of patches, each of which is a window and its margin."""
+    """Feature rows of patches; a patch is a window with its margin."""
     cells = np.empty((WINDOW, WINDOW, CHANNELS), np.float32)
     shades = np.empty((WINDOW * SIDE, WINDOW * SIDE), np.uint16)
     first, inner = np.zeros((1, 2), np.int64), slice(margin * CELL, (margin + WINDOW) * CELL)
@@ -361,7 +361,7 @@ def describe_windows(patches: UInt8, margin: int, shares: Float32, table: UInt16
 
 @kernel("void(float32[:,::1], float32[:,::1], float32[:,::1])", **_OPTIONS)
 def add_cell_scores(grid: Float32, weights: Float32, scores: Float32) -> None:
-    """Add the products of each row of cells, (34 columns,), with each row of the windows that it lies in."""
+    """Add the products of each row of cells with the rows of all windows that contain it."""
     for row in range(len(grid)):
         for column in range(scores.shape[1]):
             cells = grid[row, column * CHANNELS : (column + WINDOW) * CHANNELS]

@@ -5,7 +5,7 @@ from __future__ import annotations
 CELL = 8  #: pixels along a side of a cell
 WINDOW = 8  #: cells along a side of a window
 CHANNELS = 34  #: features of a cell: 31 HOG, 3 colour
-MARGIN = 2  #: cells around a crop that its features depend on
+MARGIN = 2  #: cells around a crop on which its features depend
 SIDE = CELL // 2  #: shades along a side of a cell
 LIGHT = 8  #: levels of lightness
 CHROMA = 6  #: levels of a and of b

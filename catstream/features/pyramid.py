@@ -1,4 +1,4 @@
-"""The image pyramid of a frame: patches of a large object are cut from a smaller copy, which all of them share."""
+"""The image pyramid of a frame: patches of a large object are cut from a shared smaller copy."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from catstream.base.box import Window
 from catstream.features.layout import CELL, MARGIN, WINDOW
 from catstream.features.sampling import average, sample
 
-_MAX_CELLS = 62_500  # of the region around a tiny window: bounds the cost of a large frame
+_MAX_CELLS = 62_500  # in the region around a small window: bounds the cost of a large frame
 _OVERLAP = WINDOW + 2 * MARGIN  # minimum overlap of adjacent parts of a region, in cells: a window and its margin
 
 
@@ -73,7 +73,7 @@ class Pyramid:
     def near(self, scale: float) -> tuple[np.ndarray, int]:
         """The smallest level whose pixels are at most `scale` pixels of the frame wide, and their width: 1, 2, 4 ...
 
-        So linear interpolation skips none of the frame's pixels, or few. An odd last row or column is dropped.
+        So linear interpolation skips few pixels of the frame, if any. An odd last row or column is dropped.
 
         >>> image, wide = Pyramid(np.zeros((90, 121, 3), np.uint8)).near(5.9)
         >>> image.shape, wide
@@ -131,8 +131,8 @@ class Pyramid:
         resized = reduced(image, size) if averaged and scale > 1 else cv2.resize(image, size)
         return resized, (image.shape[1] * wide / columns, image.shape[0] * wide / rows)
 
-    def cut(self, x: float, y: float, across: float, down: float, size: int, turn: float = 0.0) -> np.ndarray:
-        """Cut a square of `size` pixels, centred at (x, y) and rotated by `turn` radians; the border is replicated.
+    def cut(self, x: float, y: float, across: float, down: float, size: int, angle: float = 0.0) -> np.ndarray:
+        """Cut a square of `size` pixels, centred at (x, y) and rotated by `angle` radians; the border is replicated.
 
         A pixel of the patch is `across` pixels of the frame wide and `down` high. Returns uint8 (3, size, size), blue,
         green and red, or (1, size, size) of a grey frame.
@@ -140,12 +140,12 @@ class Pyramid:
         image, wide = self.near(min(across, down))
         x, y, across, down = x / wide - 0.5, y / wide - 0.5, across / wide, down / wide
         middle = (size - 1) / 2
-        if not turn:
+        if not angle:
             patch = np.empty((1 if image.ndim == 2 else 3, size, size), np.uint8)
             lines = image.reshape(len(image), -1)
             sample(lines, x - middle * across, y - middle * down, across, down, patch)
             return patch
-        cos, sin = math.cos(turn), math.sin(turn)
+        cos, sin = math.cos(angle), math.sin(angle)
         right, below = (across * cos, across * sin), (-down * sin, down * cos)
         corner = x - (right[0] + below[0]) * middle, y - (right[1] + below[1]) * middle
         matrix = np.array([right, below, corner]).T
@@ -163,7 +163,7 @@ def planes_of(image: np.ndarray) -> np.ndarray:
 
 
 def reduced(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """An image reduced to (width, height): the mean of the pixels that a pixel covers, as by `cv2.INTER_AREA`."""
+    """Reduce an image to (width, height): a pixel is the mean of the pixels it covers, as with `cv2.INTER_AREA`."""
     across, down = 1 / (size[0] / image.shape[1]), 1 / (size[1] / image.shape[0])
     if image.ndim == 2 or min(across, down) < 1 or (across.is_integer() and down.is_integer()):
         return cv2.resize(image, size, interpolation=cv2.INTER_AREA)

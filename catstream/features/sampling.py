@@ -22,7 +22,7 @@ def sample(image: UInt8, left: float, top: float, across: float, down: float, ou
     begin = min(max(int(np.floor(left)), 0), width - 1)
     end = min(max(int(np.floor(left + (columns - 1) * across)) + 2, begin + 1), width)
     line = np.empty(image.shape[1], np.float32)
-    # For every output pixel: the indices in the line of its two neighbours, and the weight of the second one.
+    # Step 1: for each output column, the indices of its two neighbours, and the weight of the second one.
     first, second, share = np.empty(columns, np.uint32), np.empty(columns, np.uint32), np.empty(columns, np.float32)
     for i in range(columns):
         x = left + i * across
@@ -30,6 +30,7 @@ def sample(image: UInt8, left: float, top: float, across: float, down: float, ou
         first[i] = (min(max(pixel, begin), end - 1) - begin) * channels
         second[i] = (min(max(pixel + 1, begin), end - 1) - begin) * channels
         share[i] = x - np.floor(x)
+    # Step 2: for each output row, interpolate between two rows, then within the line.
     for row in range(rows):
         y = top + row * down
         pixel = int(np.floor(y))
@@ -48,7 +49,7 @@ def sample(image: UInt8, left: float, top: float, across: float, down: float, ou
 
 @function(**_ORDERED)
 def _taps(scale: float, size: int, pixels: UInt32, shares: Float32) -> None:
-    """The pixels of an axis of `size` pixels that each output pixel covers, `scale` of them; and their shares of it."""
+    """The pixels along an axis of `size` pixels that an output pixel, `scale` wide, covers; and their shares."""
     for i in range(pixels.shape[1]):
         begin, count = i * scale, 0
         end = begin + scale
@@ -74,10 +75,10 @@ def average(image: UInt8, across: float, down: float, output: UInt8) -> None:
     rows, columns = output.shape[:2]
     below, right = max(3, int(np.ceil(down)) + 1), max(3, int(np.ceil(across)) + 1)
     lines, parts = np.zeros((below, rows), np.uint32), np.zeros((below, rows), np.float32)
-    places, shares = np.zeros((right, columns), np.uint32), np.zeros((right, columns), np.float32)
+    pixels, shares = np.zeros((right, columns), np.uint32), np.zeros((right, columns), np.float32)
     _taps(down, image.shape[0], lines, parts)
-    _taps(across, image.shape[1], places, shares)
-    places *= np.uint32(3)
+    _taps(across, image.shape[1], pixels, shares)
+    pixels *= np.uint32(3)  # to indices of a line
     line = np.empty(3 * image.shape[1], np.float32)
     reduced, total = np.empty(3 * columns, np.float32), np.empty(3 * columns, np.float32)
     ready = -1
@@ -86,28 +87,28 @@ def average(image: UInt8, across: float, down: float, output: UInt8) -> None:
             part = parts[tap, row]
             if part == 0:
                 break
-            if lines[tap, row] != ready:  # two output rows may cover the same one
+            if lines[tap, row] != ready:  # two output rows may cover the same line
                 ready = lines[tap, row]
                 values = image[ready].reshape(-1)
                 for i in range(len(line)):
                     line[i] = values[i]
                 for i in range(columns):
                     blue, green, red = float32(0), float32(0), float32(0)
-                    for k in range(3):  # unrolled: mostly there are no more
-                        place, share = places[k, i], shares[k, i]
-                        blue += line[place] * share
-                        green += line[place + 1] * share
-                        red += line[place + 2] * share
+                    for k in range(3):  # unrolled: usually, there are no more
+                        pixel, share = pixels[k, i], shares[k, i]
+                        blue += line[pixel] * share
+                        green += line[pixel + 1] * share
+                        red += line[pixel + 2] * share
                     for k in range(3, right):
-                        place, share = places[k, i], shares[k, i]
-                        blue += line[place] * share
-                        green += line[place + 1] * share
-                        red += line[place + 2] * share
+                        pixel, share = pixels[k, i], shares[k, i]
+                        blue += line[pixel] * share
+                        green += line[pixel + 1] * share
+                        red += line[pixel + 2] * share
                     reduced[3 * i], reduced[3 * i + 1], reduced[3 * i + 2] = blue, green, red
             if tap == 0:
                 total[:] = 0
             for i in range(len(total)):
                 total[i] += part * reduced[i]
-        pixels = output[row].reshape(-1)
+        output_line = output[row].reshape(-1)
         for i in range(len(total)):
-            pixels[i] = np.uint8(np.rint(total[i]))
+            output_line[i] = np.uint8(np.rint(total[i]))

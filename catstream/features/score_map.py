@@ -17,8 +17,8 @@ from catstream.wire.messages import Model
 class ScoreMap:
     """Features of a part of a frame at one scale, and the scores of all windows in them.
 
-    cells   of rows x columns
-    scores  float32 (rows - 7, columns - 7), of the window whose first cell has the same index
+    cells   features, of rows x columns
+    scores  float32 (rows - 7, columns - 7), by the index of the first cell of a window
     origin  corner of the first cell in the frame, (x, y) in pixels
     step    width and height of a cell, in pixels of the frame
     """
@@ -52,7 +52,7 @@ class ScoreMap:
         (x, y), (w, h) = self.origin, self.step
         return Window(x + column * w, y + row * h, WINDOW * w, WINDOW * h)
 
-    def place(self, window: Window) -> tuple[float, float]:
+    def position(self, window: Window) -> tuple[float, float]:
         """Row and column, in fractions, of the window with the same centre: the inverse of `window`."""
         x, y = window.centre
         w, h = self.step
@@ -65,9 +65,9 @@ class ScoreMap:
         return row, column
 
     def best(self, penalty: np.ndarray | float = 0.0) -> tuple[float, Window]:
-        """The score of the window with the highest score less a penalty; and the window.
+        """The window with the highest score less a penalty, after its score.
 
-        The position of the window is interpolated, by a parabola through the neighbouring scores in both directions.
+        The position of the window is interpolated by a parabola through the neighbouring scores in both directions.
         """
         scores = self.scores
         row, column = self.argmax(penalty)
@@ -81,8 +81,8 @@ class ScoreMap:
         top = y + h * np.arange(rows)
         left = x + w * np.arange(columns)
         above_or_below = (top >= window.y + window.h) | (top + WINDOW * h <= window.y)
-        beside = (left >= window.x + window.w) | (left + WINDOW * w <= window.x)
-        return replace(self, scores=np.where(above_or_below[:, None] | beside, self.scores, np.float32(-np.inf)))
+        left_or_right = (left >= window.x + window.w) | (left + WINDOW * w <= window.x)
+        return replace(self, scores=np.where(above_or_below[:, None] | left_or_right, self.scores, np.float32(-np.inf)))
 
 
 def non_maximum_suppression(

@@ -12,13 +12,13 @@ from catstream.base.arrays import Bool, Float64
 from catstream.base.kalman import OBSERVATION, TRANSITION
 from catstream.wire.messages import Motion
 
-FEWEST = 8  #: centres that 13 free parameters can be estimated from
+FEWEST = 8  #: minimum number of centres for the estimation of 13 free parameters
 PROCESS_FLOOR = 1e-4  #: smallest variance of the process, pixels squared: 0.01 pixels a frame
 OBSERVATION_FLOOR = 1e-2  #: smallest variance of a measured centre, pixels squared: 0.1 pixels
 
 
 def prepare() -> None:
-    """Import filterpy: most of a second, with scipy.stats. Without it, the first estimate imports filterpy."""
+    """Import filterpy in advance, which takes most of a second; otherwise, the first estimate imports it."""
     import filterpy.kalman  # noqa: F401
 
 
@@ -80,7 +80,7 @@ def _smooth(
     kalman.x, kalman.P, kalman.inv = mean, covariance, _inverse
     measured = [centre if present else None for centre, present in zip(centres, _present(centres), strict=True)]
     states, covariances, _, predicted = kalman.batch_filter(measured, update_first=True)
-    # The smoother asks for the inverse of each predicted covariance, the newest first: one call for all is faster.
+    # The smoother inverts each predicted covariance, the newest first: one call for all is faster.
     inverses = iter(np.linalg.inv(predicted[-2::-1]))
     states, covariances, gains, _ = kalman.rts_smoother(states, covariances, inv=lambda _: next(inverses))
     return states, covariances, covariances[1:] @ gains[:-1].transpose(0, 2, 1)
@@ -88,10 +88,10 @@ def _smooth(
 
 def _refit(centres: np.ndarray, states: np.ndarray, covariances: np.ndarray, lagged: np.ndarray) -> Motion:
     """Maximisation: mean outer products of the residuals, plus the uncertainty of the smoothed states."""
-    push = states[1:] - states[:-1] @ TRANSITION.T
-    together = (lagged @ TRANSITION.T).sum(axis=0)
+    noise = states[1:] - states[:-1] @ TRANSITION.T
+    cross = (lagged @ TRANSITION.T).sum(axis=0)
     spread = covariances[1:].sum(axis=0) + TRANSITION @ covariances[:-1].sum(axis=0) @ TRANSITION.T
-    process = (push.T @ push + spread - together - together.T) / len(push)
+    process = (noise.T @ noise + spread - cross - cross.T) / len(noise)
 
     present = _present(centres)
     error = centres[present] - states[present] @ OBSERVATION.T
@@ -100,7 +100,7 @@ def _refit(centres: np.ndarray, states: np.ndarray, covariances: np.ndarray, lag
 
 
 def _present(centres: np.ndarray) -> Bool:
-    """Which centres were measured, (m,)."""
+    """Mask of the measured centres, (m,)."""
     present: Bool = np.isfinite(centres).all(axis=1)
     return present
 

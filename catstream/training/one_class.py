@@ -1,8 +1,7 @@
 """The paper's classifier: a one-class linear support vector machine (paper, "Training").
 
 It separates all but a share of the object's rows from the origin by the hyperplane with the largest margin. HOG rows
-are never negative, so that from the true origin it would only learn "has edges". The origin is the mean of the
-background.
+are never negative, so with the true origin it would only learn "has edges". The origin is the mean of the background.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 The classifiers of `training.classifier` compute the weights of the score from these parts of the trees:
 
     least-squares  the mean of the object; the mean and the rows of the background
-    joint          the same, and the rows of the loss tree
+    joint          as least-squares, and the rows of the loss tree
     one-class      the rows of the object; the mean of the background
 
 All of them scale the score by the means of object and background, and use the rows of the extent tree.
@@ -37,11 +37,11 @@ class Trainer:
         all models are comparable. ProtocolError if object and background have the same mean in the sample.
         """
         self._regressions[sample.object] = self._regressions.pop(sample.object, {})
-        if len(self._regressions) > self.settings.run.max_objects:  # the oldest object was forgotten
+        if len(self._regressions) > self.settings.run.max_objects:  # drop the object that was trained least recently
             del self._regressions[next(iter(self._regressions))]
         background_mean = sample.trees["background"].mean
         difference = sample.trees["object"].mean - background_mean
-        # Very few rows may give a direction in which the object does not score higher: it is not used.
+        # With very few rows, the object may not score higher along a direction. Such a direction is not used.
         scaled = [_unit_contrast(direction, difference) for direction in self._directions(sample)]
         useful = [direction for direction in scaled if direction is not None]
         weights = _unit_contrast(np.sum(useful, axis=0) if useful else _discriminant(sample), difference)
@@ -111,7 +111,7 @@ def _discriminant(sample: Sample) -> np.ndarray:
 
 
 def _unit_contrast(direction: np.ndarray, difference: np.ndarray) -> np.ndarray | None:
-    """Scale a direction so that the means differ by 1 along it; None if the object's mean is not the higher one."""
+    """Scale a direction so that the means differ by 1 along it; None if the object does not score higher."""
     contrast = float(direction @ difference)
     return direction / np.float32(contrast) if contrast > 0 else None
 

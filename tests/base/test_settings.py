@@ -54,7 +54,7 @@ WAYS = {
 def test_an_invalid_value_is_rejected_with_the_values_that_the_setting_accepts(way, name, value, takes):
     with pytest.raises(SettingsError) as error:
         WAYS[way](name, value)
-    messages = [f"setting {name} cannot be {shown!r}: it takes {takes}" for shown in (value, str(value))]
+    messages = [f"setting {name} cannot be {shown!r}: expected {takes}" for shown in (value, str(value))]
     assert str(error.value) in messages
 
 

@@ -23,7 +23,7 @@ START = Box(60, 50, 48, 40)
 def followed(frames, start, seed=0):
     frames = iter(frames)
     model = SparseCollaborativeModel(next(frames), start, np.random.default_rng(seed), particles=100)
-    return [model.follow(frame) for frame in frames]
+    return [model.track(frame) for frame in frames]
 
 
 @pytest.mark.parametrize("centre", [0.0, 1.0])

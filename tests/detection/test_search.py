@@ -17,7 +17,7 @@ def test_the_window_of_a_score_lies_in_the_frame_and_place_is_its_inverse(image)
     window = Window(30, 40, 50, 70)
     scores = ScoreMap.around(Pyramid(image), window, 20, None)
     assert scores.window(6, 6) == pytest.approx(window)
-    assert scores.place(scores.window(2.25, 7.5)) == pytest.approx((2.25, 7.5))
+    assert scores.position(scores.window(2.25, 7.5)) == pytest.approx((2.25, 7.5))
 
 
 def test_windows_of_a_region_lie_in_it(image, rng):

@@ -51,7 +51,7 @@ def test_the_label_of_a_near_miss_is_a_gaussian_of_its_distance_which_is_most_of
     around = ScoreMap.around(frame, OBJECT, 20, model)
     window = OBJECT.centred(OBJECT.centre[0] + 4, OBJECT.centre[1] - 3)  # half a cell of 8 pixels, and less
     rows, _, misses, _ = cut(frame, model, around, window)
-    row, column = around.place(window)
+    row, column = around.position(window)
     distances = {
         around.cells.row(*place).tobytes(): np.hypot(place[0] - row, place[1] - column)
         for place in np.ndindex(around.scores.shape)
