@@ -234,8 +234,8 @@ def load(records: Records) -> str:
     return _paragraph(
         f"""**At least {len(streams)} of 640x480 pixels at {record["plan"]["rate"]:.0f} frames/s, with {cores:.1f} of
         {record["machine"]["cores"]} cores.** The track of a frame arrives after {1000 * track["p50"]:.0f} ms (median;
-        99 % {1000 * track["p99"]:.0f} ms), the model trained on it after {1000 * model["p50"]:.0f} ms. `catstream
-        loadtest` measures other loads."""
+        99 % {1000 * track["p99"]:.0f} ms), the model trained on it after {1000 * model["p50"]:.0f} ms (99 %
+        {model["p99"]:.1f} s). `catstream loadtest` measures other loads."""
     )
 
 
