@@ -1,4 +1,4 @@
-"""What the tests of the wire share."""
+"""Fixtures of the tests of sockets."""
 
 from contextlib import ExitStack
 
@@ -7,12 +7,11 @@ import zmq
 
 from catstream.wire.channels import CHANNELS
 from catstream.wire.endpoint import Endpoint
-from tests.wire.examples import example
 
 
 @pytest.fixture(params=["ipc", "tcp"])
 def endpoint(request, folder):
-    """Where to meet, over each transport."""
+    """An endpoint of each transport."""
     return Endpoint.parse(str(folder) if request.param == "ipc" else request.getfixturevalue("tcp"))
 
 
@@ -28,9 +27,3 @@ def stranger(endpoint):
             return socket
 
         yield connect
-
-
-@pytest.fixture
-def message_of():
-    """A message of a channel, by its name."""
-    return lambda name: example(CHANNELS[name].messages[0])

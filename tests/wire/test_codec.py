@@ -3,16 +3,15 @@
 import dataclasses
 import struct
 import tracemalloc
-from typing import Any, Literal, get_args, get_origin
+from typing import Any, get_args
 
 import msgpack
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
-from hypothesis.extra import numpy as arrays
 
-from catstream.base.box import Box, Window
+from catstream.base.box import Box
 from catstream.base.settings import Settings, describe
 from catstream.detection.objects import Detectors
 from catstream.errors import ProtocolError
@@ -20,19 +19,9 @@ from catstream.features.pyramid import Pyramid
 from catstream.video import rendered
 from catstream.wire.channels import CHANNELS
 from catstream.wire.codec import KINDS, VERSION, decode, encode
-from catstream.wire.messages import (
-    LARGEST_GIVEN_MODELS,
-    Command,
-    Features,
-    Health,
-    ObjectFeatures,
-    Position,
-    Preview,
-    Track,
-    TrainingRows,
-)
-from catstream.wire.schema import LARGEST_INTEGER, LONGEST_LIST, LONGEST_TEXT, Array, Field, fields
-from tests.wire.examples import example as example_of
+from catstream.wire.messages import LARGEST_GIVEN_MODELS, Features, Health, ObjectFeatures, Track, TrainingRows
+from catstream.wire.schema import LONGEST_LIST, LONGEST_TEXT
+from tests.wire.examples import example
 
 
 def array(*shape: int, dtype: str = "<f4") -> np.ndarray:
@@ -44,10 +33,8 @@ def features(rows: TrainingRows) -> Features:
 
 
 BOX = Box(4.5, 3.0, 20.0, 10.0)
-EXAMPLES = {name: example_of(kind) for name, kind in KINDS.items()}
-MESSAGES = pytest.mark.parametrize("message", EXAMPLES.values(), ids=EXAMPLES)
+EXAMPLES = {name: example(kind) for name, kind in KINDS.items()}
 ALL = tuple(KINDS.values())
-FUZZ = settings(max_examples=300, suppress_health_check=[HealthCheck.too_slow])
 
 
 def packed(kind: str, about: object = None, **changes: object) -> bytes:
@@ -62,96 +49,23 @@ def fields_of(kind: str) -> dict[str, Any]:
     return sent
 
 
-def of_anna(**changes: object) -> bytes:
-    """The example of features as bytes, with some fields of its first object replaced on the wire."""
-    objects = fields_of("features")["objects"]
-    return packed("features", objects=objects | {"anna": objects["anna"] | changes})
-
-
 def retrained(**arrays: object) -> bytes:
     """The example of features as bytes, with some of its training rows replaced on the wire."""
-    training = fields_of("features")["objects"]["anna"]["training"]
-    return of_anna(training=training | {"appearance": training["appearance"] | arrays})
+    objects = fields_of("features")["objects"]
+    objects["anna"]["training"]["appearance"] |= arrays
+    return packed("features", objects=objects)
 
 
 def plain(dtype: str, shape: list[int], data: bytes) -> dict[str, object]:
     return {"dtype": dtype, "shape": shape, "data": data}
 
 
-FINITE = st.floats(-1e6, 1e6)
-SIDE = st.floats(0.5, 1e6)
-NAMES = st.just("") | st.from_regex(r"\w[\w.-]{0,63}", fullmatch=True)
-
-
-@st.composite
-def messages(draw: st.DrawFn, kind: type, width: int | None = None) -> Any:
-    """Any message of a kind that its schema allows.
-
-    width : columns of its rows; None: any
-    """
-    lengths = {"d": draw(st.integers(3, 6)) if width is None else width}
-    values = {field.name: _value(draw, field, lengths) for field in fields(kind)}
-    if kind is Preview:
-        values["jpeg"] = b"\xff\xd8\xff" + values["jpeg"]
-    if kind is Command:
-        is_box = values["verb"] == "set-box"
-        values["boxes"] = values["boxes"] if is_box else {}
-        values["box"] = (values["box"] or BOX) if is_box and not values["boxes"] else None
-        values["model"] = (values["model"] or b"") if values["verb"] == "search" else None
-    return kind(**values)
-
-
-def _value(draw: st.DrawFn, field: Field, lengths: dict[str, int]) -> Any:
-    if field.optional and draw(st.booleans()):
-        return None
-    if field.values is not None:
-        return _map(draw, field, lengths)
-    if field.is_message:
-        return draw(messages(field.type))
-    if field.is_name:
-        return draw(NAMES)
-    if array := field.array:
-        return draw(_arrays(array, tuple(_length(draw, side, lengths) for side in array.shape)))
-    return draw(_plain(field))
-
-
-def _map(draw: st.DrawFn, field: Field, lengths: dict[str, int]) -> dict[str, Any]:
-    named = field.named
-    if named is None:
-        names = NAMES if field.keys.is_name else st.text(max_size=8)
-        return {name: _value(draw, field.values, lengths) for name in draw(st.sets(names, max_size=3))}
-    names = [name for name in named.columns if name in named.required or draw(st.booleans())]
-    if field.values.is_message:
-        return {name: draw(messages(field.values.type, lengths["d"] + named.columns[name])) for name in names}
-    return {name: _value(draw, field.values, lengths) for name in names}
-
-
-def _length(draw: st.DrawFn, side: int | str, lengths: dict[str, int]) -> int:
-    return lengths.setdefault(side, draw(st.integers(0, 3))) if isinstance(side, str) else side
-
-
-def _arrays(limits: Array, shape: tuple[int, ...]) -> st.SearchStrategy[np.ndarray]:
-    low = max(limits.low, limits.above + 0.5, -1000)
-    numbers = st.floats(low, min(limits.high, 1000), width=32)
-    return arrays.arrays(limits.dtype, shape, elements=numbers | st.just(np.nan) if limits.may_be_nan else numbers)
-
-
-def _plain(field: Field) -> st.SearchStrategy[Any]:
-    if get_origin(field.type) is Literal:
-        return st.sampled_from(get_args(field.type))
-    whole = st.integers(1, LARGEST_INTEGER)
-    if get_origin(field.type) is tuple:
-        return st.lists(whole, max_size=4).map(tuple)
-    rectangle = field.type in (Box, Window)
-    kinds = {bool: st.booleans(), int: whole, float: FINITE, str: st.text(max_size=8), bytes: st.binary(max_size=8)}
-    return st.builds(field.type, FINITE, FINITE, SIDE, SIDE) if rectangle else kinds[field.type]
-
-
-@FUZZ
-@given(st.sampled_from(ALL).flatmap(messages))
-def test_every_message_that_the_schema_allows_arrives_as_it_was_sent(message):
-    arrived = decode(encode(message), type(message))
-    assert type(arrived) is type(message)
+@pytest.mark.parametrize("full", [True, False])
+@pytest.mark.parametrize("kind", ALL)
+def test_every_kind_of_message_arrives_as_it_was_sent(kind, full):
+    message = example(kind, full)
+    arrived = decode(encode(message), kind)
+    assert type(arrived) is kind
     np.testing.assert_equal(dataclasses.asdict(arrived), dataclasses.asdict(message))
 
 
@@ -168,13 +82,13 @@ def test_arrays_and_bytes_are_copied_once_on_arrival(kind):
         tracemalloc.stop()
 
 
-def test_arrays_travel_row_by_row_whatever_their_layout():
+def test_arrays_are_sent_row_by_row_in_any_memory_layout():
     rows = TrainingRows(np.asfortranarray(array(3, 5)), array(3), array(3))
     arrived = decode(encode(features(rows)), Features)
     np.testing.assert_array_equal(arrived.objects[""].training["appearance"].rows, array(3, 5))
 
 
-def test_features_of_as_many_objects_as_there_may_be_fit_into_their_channel():
+def test_features_of_the_most_objects_fit_into_their_channel():
     detectors, ((image, box),) = Detectors(Settings()), rendered.render(1, (320, 240))
     pyramid = Pyramid(image)
     _, features = detectors.step(pyramid, results={"": detectors.begin("", pyramid, box)})
@@ -182,12 +96,12 @@ def test_features_of_as_many_objects_as_there_may_be_fit_into_their_channel():
     assert largest < CHANNELS["all-features"].limit == CHANNELS["features"].limit
 
 
-def test_a_field_of_a_later_version_is_ignored():
+def test_field_of_a_later_version_is_ignored():
     assert decode(packed("track", colour="red"), Track) == EXAMPLES["track"]
 
 
-@MESSAGES
-def test_a_message_of_another_kind_is_rejected(message):
+@pytest.mark.parametrize("message", EXAMPLES.values(), ids=EXAMPLES)
+def test_message_of_another_kind_is_rejected(message):
     others = [kind for kind in ALL if kind is not type(message)]
     with pytest.raises(ProtocolError, match=f"got '{type(message).__name__.lower()}'"):
         decode(encode(message), *others)
@@ -200,11 +114,9 @@ REJECTED = {
     "set-box without a box": packed("command", box=None),
     "set-box with a box and several": packed("command", boxes={"anna": [1, 2, 3, 4]}),
     "a dtype that is not allowed": retrained(rows=plain("<f8", [3, 5], bytes(120))),
-    "objects": retrained(rows=plain("|O", [3, 5], bytes(120))),
     "rows in one dimension": retrained(rows=plain("<f4", [15], bytes(60))),
     "a negative side": retrained(rows=plain("<f4", [-3, -5], bytes(60))),
     "less data than its shape": retrained(rows=plain("<f4", [3, 5], bytes(59))),
-    "a side of 2**63": retrained(rows=plain("<f4", [0, 2**63], b"")),
     "sides whose product is huge": retrained(rows=plain("<f4", [2**32, 2**32], bytes(60))),
     "NaN in an array": retrained(rows=plain("<f4", [3, 5], struct.pack("<f", np.nan) * 15)),
     "NaN as a number": packed("track", score=np.nan),
@@ -213,18 +125,15 @@ REJECTED = {
     "a tree of another width": packed("sample", trees=TREES_SENT | {"loss": TREES_SENT["object"]}),
     "a sample without the object's tree": packed("sample", trees={"loss": TREES_SENT["loss"]}),
     "a tree of no head": packed("sample", trees=TREES_SENT | {"unknown": TREES_SENT["loss"]}),
-    "training rows of no group": of_anna(training={"unknown": {}}),
     "a name that is no name": packed("features", objects={"an na": {}}),
     "another object in the envelope": packed("track", about="ann"),
     "an object in the envelope, and none in the fields": packed("position", about="anna"),
-    "lists in lists, as object": b"\x95\x05\xa3end" + b"\x91" * 1015 + b"\x90\xa0\x80",
     "a number as object": packed("track", about=1, object=1),
     "more objects than a map may have": packed("position", versions={f"o{i}": 1 for i in range(257)}),
     "rows of another width in another group": retrained(rows=plain("<f4", [3, 4], bytes(48))),
     "a picture that is no JPEG": packed("preview", jpeg=b"<svg onload=...>"),
     "a picture above its limit": packed("preview", jpeg=b"\xff\xd8\xff" + bytes(1 << 19)),
     "a box without width": packed("track", box=[1.0, 2.0, 0.0, 4.0]),
-    "a box of three numbers": packed("track", box=[1.0, 2.0, 3.0]),
     "a state that does not exist": packed("track", state="asleep"),
     "a negative frame": packed("track", frame=-1),
     "a frame above 2**53": packed("track", frame=2**53 + 1),
@@ -233,28 +142,24 @@ REJECTED = {
     "another version": msgpack.packb([VERSION + 1, "track", "", "", {}]),
     "a kind that does not exist": msgpack.packb([VERSION, "orders", "", "", {}]),
     "no envelope": msgpack.packb({"frame": 1}),
-    "nothing": b"",
     "half a message": encode(EXAMPLES["features"])[:-20],
     "more than a message": encode(EXAMPLES["track"]) + b"\x00",
     "a map of bytes": b"\x95\x05\xa3end\xa0\xa0\x82\xc4\x05frame\x01\xa6reason\xa1x",
     "a list of four thousand million": b"\x95\x05\xa3end\xa0\xa0\xdd\xff\xff\xff\xff",
     "a map of four thousand million": b"\x95\x05\xa3end\xa0\xa0\xdf\xff\xff\xff\xff",
-    "bytes of four gigabytes": b"\x95\x05\xa3end\xa0\xa0\xc6\xff\xff\xff\xff",
     "a text of four gigabytes": b"\x95\x05\xdb\xff\xff\xff\xff",
-    "a list longer than any message's": msgpack.packb([VERSION, "end", "", "", [None] * 257]),
     "a reason longer than a page": packed("end", reason="x" * (LONGEST_TEXT + 1)),
     "an extension type": b"\x95\x05\xa3end\xa0\xa0\xd4\x05\x00",
     "a text for bytes": packed("modelfile", file="YSBmaWxl"),
     "a text for the bytes of an array": retrained(labels=plain("<f4", [3], "AAAA" * 4)),
     "a text that is not UTF-8": b"\x95\x05\xa3end\xa0\xa0\x81\xa6reason\xa1\xff",
-    "a byte that msgpack does not use": b"\x95\x05\xa3end\xa0\xa0\xc1",
     "lists in lists, as fields": b"\x95\x05\xa3end\xa0\xa0" + b"\x91" * 1015 + b"\x90",
     "lists in lists without end": b"\x91" * 100_000,
 }
 
 
 @pytest.mark.parametrize("data", REJECTED.values(), ids=REJECTED)
-def test_a_message_that_violates_its_schema_is_rejected_on_arrival(data):
+def test_message_that_violates_its_schema_is_rejected(data):
     with pytest.raises(ProtocolError):
         decode(data, *ALL)
 
@@ -265,14 +170,12 @@ def test_a_message_that_violates_its_schema_is_rejected_on_arrival(data):
         features(TrainingRows(array(3, 5, dtype="<f8"), array(3), array(3))),
         features(TrainingRows(array(3, 5), array(4), array(3))),
         dataclasses.replace(EXAMPLES["track"], score=float("nan")),
-        dataclasses.replace(EXAMPLES["track"], frame=-1),
         dataclasses.replace(EXAMPLES["track"], object="an na"),
-        Position(5, 7, 0, {"an/na": 2}),
         Health("detector", 0.0, trouble="x" * (LONGEST_TEXT + 1)),
     ],
-    ids=["dtype", "shape", "NaN", "negative", "name", "name in a map", "a text that is too long"],
+    ids=["dtype", "shape", "NaN", "name", "a text that is too long"],
 )
-def test_a_message_that_would_be_rejected_on_arrival_is_not_sent(message):
+def test_message_that_violates_its_schema_is_not_sent(message):
     with pytest.raises(ProtocolError):
         encode(message)
 
@@ -290,7 +193,7 @@ BOMBS = {"lists": b"\x90", "maps": b"\x80", "lists of maps": b"\x91\x81\xa1x\x80
 
 @pytest.mark.parametrize("place", ["colour", "weights", "version"])
 @pytest.mark.parametrize("bomb", BOMBS.values(), ids=BOMBS)
-def test_many_entries_take_little_memory_whatever_field_they_are_in(bomb, place):
+def test_too_many_entries_take_little_memory_in_any_field(bomb, place):
     data = b"\x95\x05\xa5model\xa0\xa0\x81" + msgpack.packb(place) + many(bomb)
     tracemalloc.start()
     try:
@@ -301,7 +204,7 @@ def test_many_entries_take_little_memory_whatever_field_they_are_in(bomb, place)
         tracemalloc.stop()
 
 
-def test_as_many_entries_arrive_as_the_schema_allows():
+def test_message_with_the_most_entries_arrives():
     names = [f"o{i}" for i in range(LONGEST_LIST)]
     health = Health("detector", 0.0, objects={name: dict.fromkeys(names, 1.5) for name in names})
     assert decode(encode(health), Health) == health
@@ -317,19 +220,10 @@ VALUES = st.recursive(
 )
 
 
-def decoded_or_refused(data: bytes) -> None:
-    """The law of every arrival: a message that keeps all promises, or a ProtocolError."""
-    try:
-        message = decode(data, *ALL)
-    except ProtocolError:
-        return
-    encode(message)
-
-
-@FUZZ
-@given(st.sampled_from(ALL), st.data())
-def test_any_value_in_any_field_arrives_whole_or_is_rejected(kind, data):
-    version, name, about, run, sent = msgpack.unpackb(encode(data.draw(messages(kind))))
+@settings(max_examples=300)
+@given(st.sampled_from(ALL), st.booleans(), st.data())
+def test_any_value_in_any_field_arrives_whole_or_is_rejected(kind, full, data):
+    version, name, about, run, sent = msgpack.unpackb(encode(example(kind, full)))
     place = sent
     while isinstance(inner := place[key := data.draw(st.sampled_from(sorted(place)))], dict) and inner:
         if data.draw(st.booleans()):
@@ -337,18 +231,8 @@ def test_any_value_in_any_field_arrives_whole_or_is_rejected(kind, data):
         place = inner
     place[key] = data.draw(VALUES)
     about, run = data.draw(st.just(about) | VALUES), data.draw(st.just(run) | VALUES)
-    decoded_or_refused(msgpack.packb([version, name, about, run, sent]))
-
-
-@FUZZ
-@given(
-    st.sampled_from(sorted(EXAMPLES)),
-    st.lists(st.tuples(st.integers(0, 2**16), st.integers(0, 255)), min_size=1, max_size=8),
-    st.integers(0, 2**16),
-)
-def test_damaged_bytes_arrive_whole_or_are_rejected(kind, changes, cut):
-    data = bytearray(encode(EXAMPLES[kind]))
-    for place, value in changes:
-        data[place % len(data)] = value
-    decoded_or_refused(bytes(data))
-    decoded_or_refused(bytes(data[: cut % len(data)]))
+    try:
+        message = decode(msgpack.packb([version, name, about, run, sent]), *ALL)
+    except ProtocolError:
+        return
+    encode(message)

@@ -1,4 +1,4 @@
-"""Where the processes meet, and who is kept out."""
+"""Endpoints: their addresses, their private folders, and the discovery of running pipelines."""
 
 import os
 import shutil
@@ -34,13 +34,13 @@ def test_ports_follow_the_table():
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "127.1.2.3", "localhost", "[::1]"])
 @pytest.mark.parametrize("other", ["0.0.0.0", "192.168.1.1", "[fe80::1%eth0]", "example.org", "*", "127.0.0.1.nip.io"])
-def test_without_keys_only_endpoints_of_this_machine_are_accepted(host, other):
+def test_endpoint_of_other_machines_requires_keys(host, other):
     assert Endpoint.parse(f"tcp://{host}:5700").port == 5700
     with pytest.raises(ServiceError, match="other machines"):
         Endpoint.parse(f"tcp://{other}:5700")
 
 
-def test_a_host_name_of_one_address_family_is_listened_on_and_resolved_in_it(folder, monkeypatch):
+def test_host_name_is_resolved_to_its_address_family(folder, monkeypatch):
     create(folder / "keys")
     known = {"four": ["192.0.2.1"], "six": ["2001:db8::1"], "both": ["2001:db8::1", "192.0.2.1"]}
 
@@ -63,22 +63,16 @@ def test_a_host_name_of_one_address_family_is_listened_on_and_resolved_in_it(fol
         ("x" * 100, "too long.*TMPDIR"),
         *((f"tcp://{rest}", "more ports after PORT") for rest in ("", "127.0.0.1", ":5700", "[:5700", "[12]:5700")),
         *((f"tcp://127.0.0.1:{port}", "more ports after PORT") for port in ("0", "65535", "x")),
+        *((text, "a folder or tcp") for text in ("localhost:5700", ":5700", "tcp:/camera:5700", "//[::1]:5700/")),
     ],
 )
-def test_an_invalid_endpoint_is_rejected(text, word):
+def test_invalid_endpoint_is_an_error(text, word):
     with pytest.raises(ServiceError, match=word):
         Endpoint.parse(text)
 
 
-def test_a_private_folder_is_for_this_user_and_removed_afterwards():
-    with private_folder() as folder:
-        assert mode(folder) == 0o700
-        (folder / "features").touch()
-    assert not folder.exists()
-
-
 @pytest.mark.parametrize("disk", [65_536], indirect=True)
-def test_a_full_disk_for_temporary_files_is_an_error_that_names_it(disk, monkeypatch):
+def test_full_disk_for_temporary_files_is_an_error_that_names_it(disk, monkeypatch):
     monkeypatch.setattr(tempfile, "tempdir", str(disk))
     monkeypatch.delenv("XDG_RUNTIME_DIR", raising=False)  # which is taken if the names of the disk's are too long
     (disk / "ballast").write_bytes(bytes(65_536))
@@ -96,10 +90,9 @@ def test_no_folder_for_temporary_files_is_an_error(monkeypatch):
     monkeypatch.delenv("XDG_RUNTIME_DIR", raising=False)
     with pytest.raises(ServiceError, match="TMPDIR"), private_folder():
         pass
-    assert running() == []
 
 
-def test_a_folder_that_is_made_is_for_this_user_alone_and_another_one_has_to_be(folder):
+def test_folder_of_sockets_is_private_to_this_user(folder):
     with reserve_endpoint(str(folder / "a" / "b"), folder):
         assert mode(folder / "a" / "b") == 0o700
     (folder / "file").touch()
@@ -123,7 +116,7 @@ def killed(place: str = "") -> Path:
     return Path(subprocess.run([sys.executable, "-c", script, place], capture_output=True, text=True).stdout.strip())
 
 
-def test_the_folder_of_a_killed_process_is_removed_and_that_of_a_running_one_is_not(folder, monkeypatch):
+def test_private_folder_of_a_killed_process_is_removed(folder, monkeypatch):
     monkeypatch.setattr(tempfile, "tempdir", str(folder))
     monkeypatch.setenv("TMPDIR", str(folder))
     monkeypatch.delenv("XDG_RUNTIME_DIR", raising=False)
@@ -132,11 +125,11 @@ def test_the_folder_of_a_killed_process_is_removed_and_that_of_a_running_one_is_
     assert running() == []
     with private_folder() as first, private_folder() as second:
         assert not left.exists()
-        assert first.exists()
-        assert second.exists()
+        assert mode(first) == mode(second) == 0o700
+    assert not first.exists()
 
 
-def test_no_socket_file_is_left_of_a_pipeline(folder):
+def test_pipeline_leaves_no_socket_files(folder):
     before = set(folder.iterdir())
     with reserve_endpoint(str(folder), folder) as endpoint:
         for channel, sender in PLACES:
@@ -145,20 +138,16 @@ def test_no_socket_file_is_left_of_a_pipeline(folder):
 
 
 @pytest.mark.parametrize("place", ["", "run", "tcp://127.0.0.1:5999"], ids=["a folder of its own", "a folder", "tcp"])
-def test_a_running_pipeline_is_found_until_it_ends(folder, place):
+def test_running_pipeline_is_found_until_it_ends(folder, place):
     place = str(folder / place) if place == "run" else place
-    with private_folder() as private, reserve_endpoint(place, private) as endpoint:
+    source = os.fsdecode(b"walk\xff.mp4")  # not UTF-8
+    with private_folder() as private, reserve_endpoint(place, private, source=source) as endpoint:
         assert endpoint in running()
+        assert source_at(endpoint) == source
     assert endpoint not in running()
 
 
-def test_only_running_pipeline_is_found_if_the_name_of_its_source_is_not_utf_8():
-    source = os.fsdecode(b"walk\xff.mp4")
-    with private_folder() as own, reserve_endpoint("", own, source=source) as endpoint:
-        assert (str(find()), find().source) == (str(endpoint), source)
-
-
-def test_a_pipeline_is_found_with_its_keys_and_hides_no_other_if_they_cannot_be_read(tmp_path):
+def test_pipeline_with_unreadable_keys_hides_no_other(tmp_path):
     create(tmp_path / "keys")
     with (
         private_folder() as one,
@@ -172,13 +161,3 @@ def test_a_pipeline_is_found_with_its_keys_and_hides_no_other_if_they_cannot_be_
         assert str(good) in {str(endpoint) for endpoint in running()}
         assert str(other) not in {str(endpoint) for endpoint in running()}
         assert find().source == source_at(Endpoint.parse(str(good))) == "good.mp4"
-
-
-@pytest.mark.parametrize("text", ["localhost:5700", ":5700", "tcp:/camera.example.org:5700", "//[::1]:5700/"])
-def test_an_address_without_its_prefix_is_not_taken_for_a_folder(text, folder, monkeypatch):
-    monkeypatch.chdir(folder)
-    with pytest.raises(ServiceError, match="a folder or tcp://HOST:PORT, got"):
-        Endpoint.parse(text)
-    if "/" not in text:
-        (folder / text).mkdir()
-        assert Endpoint.parse(text).folder == Path(text)

@@ -21,7 +21,7 @@ ASKS = b""  # the frame by which a sender asks for the position
 
 
 def payload(seq):
-    """What message `seq` holds."""
+    """The content of message `seq`."""
     return b"message %d" % seq
 
 
@@ -59,7 +59,7 @@ class Histories(RuleBasedStateMachine):
         self.connections += 1
         self.peer = b"connection %d" % self.connections
 
-    # What the shells do.
+    # The steps of `Sender` and `Receiver`.
 
     def push(self):
         """Push the next message if there is room."""
@@ -118,7 +118,7 @@ class Histories(RuleBasedStateMachine):
                 assert self.senders > 1, "only a sender that was restarted lacks what the receiver has not stored yet"
             self.sender_dies()
 
-    # What happens.
+    # Events.
 
     @rule()
     def send(self):
@@ -127,7 +127,7 @@ class Histories(RuleBasedStateMachine):
             self.transmit()
 
     @rule()
-    def send_while_nobody_is_connected(self):
+    def send_without_a_connection(self):
         if self.resumed:
             self.push()
 
@@ -185,7 +185,7 @@ class Histories(RuleBasedStateMachine):
 
     @rule()
     def sender_dies(self):
-        """What it has transmitted may still arrive."""
+        """Its transmitted frames may still arrive."""
         self.to_sender.clear()
         self.start_sender()
 
@@ -194,18 +194,18 @@ class Histories(RuleBasedStateMachine):
         if seq <= self.receiver.processed:  # one that is not of the stream is rejected before it is counted
             self.arrives(STRANGER, payload(seq) if seq else ASKS)
 
-    # What holds at any moment.
+    # Invariants.
 
     @invariant()
     def the_window_is_never_exceeded(self):
         if self.senders:
-            kept = [frame for _, frame in self.sender._unacknowledged]
-            assert len(kept) <= self.size
-            assert kept == [payload(seq) for seq in range(self.sender.sent - len(kept) + 1, self.sender.sent + 1)]
-            assert self.sender._in_flight <= len(kept)
+            copies = [frame for _, frame in self.sender._unacknowledged]
+            assert len(copies) <= self.size
+            assert copies == [payload(seq) for seq in range(self.sender.sent - len(copies) + 1, self.sender.sent + 1)]
+            assert self.sender._in_flight <= len(copies)
 
     @invariant()
-    def what_is_reported_as_stored_is_on_disk(self):
+    def messages_reported_as_stored_are_on_disk(self):
         if self.senders and self.resumed:
             self.promised = max(self.promised, self.sender.stored)
             assert self.promised <= self.disk
@@ -238,7 +238,7 @@ TestHistories.settings = settings(max_examples=150, stateful_step_count=60)
 
 
 @given(processed=st.integers(0, 5), seq=st.integers(1, 9))
-def test_an_end_is_delivered_once_at_any_number_up_to_the_next_one(processed, seq):
+def test_end_is_delivered_once_at_any_number_up_to_the_next(processed, seq):
     """A restarted sender may end before it has repeated what was delivered; a gap before the end is asked for."""
     receiver = ReceiveWindow(Position(processed, processed), 4)
     delivered, _ = receiver.receive(b"restarted", seq, 1.0, last=True)
@@ -261,13 +261,13 @@ def filled(size, count):
 
 
 def frames(window):
-    """What a sender transmits now."""
+    """The frames that a sender transmits now."""
     sent = []
     window.transmit(sent.append)
     return sent
 
 
-def test_a_sender_accepts_no_message_once_those_that_it_keeps_take_256_mib():
+def test_sender_accepts_no_message_beyond_256_mib():
     window, large = SendWindow("features", 9, 0.0), bytes(64 << 20)
     for seq in range(1, 5):
         assert not window.full
@@ -282,7 +282,7 @@ def test_a_sender_accepts_no_message_once_those_that_it_keeps_take_256_mib():
     assert not window.full
 
 
-def test_a_frame_that_the_socket_did_not_take_is_transmitted_again():
+def test_frame_that_the_socket_rejects_is_transmitted_again():
     window = filled(size=4, count=0)
     window.push(1, payload(1))
     window.push(2, payload(2))
@@ -292,7 +292,7 @@ def test_a_frame_that_the_socket_did_not_take_is_transmitted_again():
     assert frames(window) == []
 
 
-def test_a_message_that_is_missing_is_reported_at_once_and_then_only_now_and_then():
+def test_missing_message_is_reported_at_once_and_then_rarely():
     window = ReceiveWindow(Position(), size=8)
     assert window.receive(b"peer", 2, now=0.0) == (False, Position(again=True))
     assert window.receive(b"peer", 1, now=0.0) == (True, None)
@@ -302,7 +302,7 @@ def test_a_message_that_is_missing_is_reported_at_once_and_then_only_now_and_the
     assert window.receive(b"peer", 5, now=PATIENCE_SECONDS + 0.01) == report
 
 
-def test_a_sender_goes_back_to_what_was_taken_and_once_on_each_connection():
+def test_sender_goes_back_once_on_each_connection():
     window = filled(size=5, count=5)
     window.receive(Position(2, 3, again=True), now=1.0)
     assert frames(window) == [payload(4), payload(5)]
@@ -313,7 +313,7 @@ def test_a_sender_goes_back_to_what_was_taken_and_once_on_each_connection():
     assert frames(window) == [payload(3), payload(4), payload(5)]
 
 
-def test_a_sender_asks_only_while_messages_wait_and_not_more_often_than_its_patience():
+def test_sender_asks_only_while_messages_wait():
     window = SendWindow("features", 4, now=0.0)
     assert not window.must_ask(99.0)
     window.push(1, payload(1))
@@ -328,7 +328,7 @@ def test_a_sender_asks_only_while_messages_wait_and_not_more_often_than_its_pati
 
 
 @pytest.mark.parametrize("late", [Position(1, 3), Position(2, 2)], ids=["stored less", "received less"])
-def test_an_acknowledgement_that_steps_back_is_rejected_and_changes_nothing(late):
+def test_acknowledgement_that_steps_back_is_ignored(late):
     window = filled(size=4, count=4)
     window.receive(Position(2, 3), now=0.0)
     assert not window.receive(late, now=50.0)
@@ -336,7 +336,7 @@ def test_an_acknowledgement_that_steps_back_is_rejected_and_changes_nothing(late
     assert window.must_ask(50.0), "it is no sign of life"
 
 
-def test_messages_in_memory_due_to_a_full_disk_are_acknowledged_but_not_stored():
+def test_messages_in_memory_are_acknowledged_but_not_stored():
     window = filled(size=4, count=3)
     window.receive(Position(3, 3, in_memory=2), now=0.0)
     assert (window.acknowledged, window.stored) == (3, 1)
@@ -345,7 +345,7 @@ def test_messages_in_memory_due_to_a_full_disk_are_acknowledged_but_not_stored()
         window.receive(Position(1, 1, again=True), now=0.0)
 
 
-def test_a_receiver_detects_another_stream_and_accepts_messages_of_an_earlier_sender():
+def test_sender_detects_the_receiver_of_another_stream():
     window = SendWindow("features", 4, now=0.0)
     window.resume(3, Position(5, 5))
     window.receive(Position(9, 9), now=0.0)

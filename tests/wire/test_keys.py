@@ -17,23 +17,21 @@ from catstream.wire.channels import ALL_FEATURES, CHANNELS, CONTROL, TRACKS
 from catstream.wire.codec import encode
 from catstream.wire.commands import Requester, Responder
 from catstream.wire.endpoint import Endpoint
-from catstream.wire.keys import ROLES, Keys, allow, clients, create
+from catstream.wire.keys import Keys, allow, clients, create
 from catstream.wire.messages import Answer, Command, End, Features, Position
 from catstream.wire.newest import Publisher, Subscriber
 from catstream.wire.rejects import rejected
-from catstream.wire.results import ResultsReceiver
 from tests.wire.examples import track
 
 WINDOW = 4
 CLIENTS = {"watcher": "watch", "operator": "control", "host": "pipeline"}  # name and role
-WATCHED = [name for name, channel in CHANNELS.items() if channel.role == "watch"]
 
-#: The clients that may not connect to each channel.
-OUTSIDE = [(name, who) for name in CHANNELS for who in ("none", "wrong", "revoked")] + [
-    (name, who)
-    for name, channel in CHANNELS.items()
-    for who, role in CLIENTS.items()
-    if ROLES.index(role) < ROLES.index(channel.role)
+#: The clients that may not connect to a channel of each role.
+OUTSIDE = [
+    *((name, who) for name in ("tracks", "control", "all-features") for who in ("none", "wrong", "revoked")),
+    ("control", "watcher"),
+    ("all-features", "watcher"),
+    ("all-features", "operator"),
 ]
 
 
@@ -54,22 +52,19 @@ def place(keys, tcp):
 
 
 @pytest.fixture
-def listener(place, message_of):
-    """Opens the listening side of a channel; returns a function that takes or sends a message."""
+def listener(place):
+    """Opens the listening side of a channel; returns a function that receives or sends a message."""
     with ExitStack() as stack:
 
         def listen(name):
             if name == "all-features":
                 receiver = stack.enter_context(Receiver(ALL_FEATURES, place(), Position(), WINDOW))
                 return lambda: receiver.receive(0.02)
-            if name == "results":
-                owner = stack.enter_context(ResultsReceiver(place(), WINDOW, 0))
-                return lambda: owner.receive(0.02)
             if name == "control":
                 responder = stack.enter_context(Responder(CONTROL, place()))
                 return lambda: responder.receive_all() or None
-            publisher = stack.enter_context(Publisher(CHANNELS[name], place(), CHANNELS[name].senders[0]))
-            return lambda: publisher.send(message_of(name))
+            publisher = stack.enter_context(Publisher(TRACKS, place()))
+            return lambda: publisher.send(track(1))
 
         yield listen
 
@@ -80,14 +75,13 @@ def stranger():
     with ExitStack() as stack:
 
         def connect(name, endpoint):
-            kind = {"all-features": zmq.DEALER, "control": zmq.DEALER, "results": zmq.PUSH}.get(name, zmq.SUB)
-            socket = stack.enter_context(zmq.Context.instance().socket(kind))
+            socket = stack.enter_context(zmq.Context.instance().socket(zmq.SUB if name == "tracks" else zmq.DEALER))
             socket.linger = 0
             if endpoint.keys is not None:
                 socket.curve_serverkey = endpoint.keys.server
                 socket.curve_publickey, socket.curve_secretkey = endpoint.keys.public, endpoint.keys.secret
             socket.connect(endpoint.address(CHANNELS[name]))
-            if kind == zmq.SUB:
+            if name == "tracks":
                 socket.subscribe(b"")
             else:
                 with suppress(zmq.Again):  # it may be rejected already
@@ -97,7 +91,7 @@ def stranger():
         yield connect
 
 
-def test_key_files_and_their_folders_are_private_whatever_the_umask(folder):
+def test_key_files_and_folders_are_private_with_any_umask(folder):
     before = os.umask(0)
     try:
         create(folder / "keys")
@@ -124,7 +118,7 @@ def test_keys_are_not_overwritten_and_names_are_no_paths(keys):
     assert set(clients(keys)) == {*CLIENTS, "pipeline"}
 
 
-def test_keys_that_other_users_can_read_and_keys_of_a_client_are_rejected(keys, place):
+def test_keys_that_are_readable_or_of_a_client_are_rejected(keys, place):
     with pytest.raises(ServiceError, match="a pipeline needs the folder that `catstream keys new` made"):
         Publisher(TRACKS, place("watcher"))
     known = Keys.load(keys)
@@ -135,56 +129,53 @@ def test_keys_that_other_users_can_read_and_keys_of_a_client_are_rejected(keys, 
 
 
 @pytest.mark.parametrize("text", [b"", b"public = 'short'", b"public = 1", b"\xff\x00", b"public = " + b"[" * 4000])
-def test_a_damaged_file_is_named(keys, text):
+def test_damaged_key_file_is_an_error_that_names_it(keys, text):
     (keys / "client.key").write_bytes(text)
     with pytest.raises(ServiceError, match=r"client\.key .*make new keys"):
         Keys.load(keys)
 
 
-@pytest.mark.parametrize("name", WATCHED)
-def test_a_client_that_may_watch_receives_messages(name, place, listener, until):
-    turn, heard = listener(name), []
-    with Subscriber(CHANNELS[name], place("watcher")) as reader:
-        until(lambda: heard, lambda: (turn(), heard.extend(reader.receive_all())))
-
-
 @pytest.mark.parametrize(("name", "who"), OUTSIDE)
-def test_a_client_without_permission_receives_nothing_and_is_counted_and_logged_once(
+def test_client_without_permission_receives_nothing_and_is_logged_once(
     name, who, keys, place, listener, stranger, until, caplog
 ):
     reason = who if who in CLIENTS else ""
     if who == "revoked":
         who, reason = "host", Keys.load(keys.parent / "host").public.decode()
         (keys / "clients" / who).unlink()
-    turn, taken, before = listener(name), [], rejected()
+    turn, received, before = listener(name), [], rejected()
     one, two = stranger(name, place(who)), stranger(name, place("none" if who == "wrong" else who))
-    until(lambda: rejected() >= before + 2, lambda: taken.append(turn()))
-    assert not any(taken)
+    until(lambda: rejected() >= before + 2, lambda: received.append(turn()))
+    assert not any(received)
     assert not one.poll(50)
     assert not two.poll(0)
-    told = [record.message for record in caplog.records if "rejected" in record.message]
-    assert len(told) <= 1, "once for all, where it was not told before"
-    assert not reason or reason in told[0]
+    logged = [record.message for record in caplog.records if "rejected" in record.message]
+    assert len(logged) <= 1, "once for all, where it was not logged before"
+    assert not reason or reason in logged[0]
 
 
-def test_the_processes_and_a_client_with_the_role_control_send_with_their_keys(place, until):
-    taken, answers = [], []
+def test_clients_exchange_messages_according_to_their_roles(place, until):
+    features, answers, tracks = [], [], []
     with (
         Receiver(ALL_FEATURES, place(), Position(), WINDOW) as receiver,
         Sender(ALL_FEATURES, place(), WINDOW) as sender,
         Responder(CONTROL, place()) as detector,
         Requester(CONTROL, place("operator")) as operator,
+        Publisher(TRACKS, place()) as publisher,
+        Subscriber(TRACKS, place("watcher")) as watcher,
     ):
 
         def turn():
             sender.poll(0)
-            taken.append(receiver.receive(0.02))
+            publisher.send(track(1))
+            features.append(receiver.receive(0.02))
+            tracks.append(watcher.receive(0.02))
             for command in detector.receive_all():
                 detector.answer(Answer(command.id, True, "", 1))
             answers.append(operator.ask(Command("1", "pause"), 0.05))
 
         sender.send(Features(0, 0.0, {}))
-        until(lambda: any(taken) and answers[-1] is not None, turn)
+        until(lambda: any(features) and any(answers) and any(tracks), turn)
 
 
 @pytest.mark.parametrize(
@@ -196,7 +187,7 @@ def test_the_processes_and_a_client_with_the_role_control_send_with_their_keys(p
         ("keys", "wrong", "is a pipeline running there, with the keys in .*wrong"),
     ],
 )
-def test_a_client_that_cannot_connect_gets_an_error_that_says_what_to_check(place, until, server, client, cause):
+def test_client_that_cannot_connect_gets_an_error_with_the_cause(place, until, server, client, cause):
     at = place(client)
     address = Address(str(at), keys=str(at.keys.folder) if at.keys is not None else "")
     with (
@@ -210,7 +201,7 @@ def test_a_client_that_cannot_connect_gets_an_error_that_says_what_to_check(plac
             stopping.result()
 
 
-def test_a_client_is_allowed_and_revoked_without_a_restart_unless_a_file_is_damaged(keys, place, until):
+def test_client_is_allowed_and_revoked_without_a_restart(keys, place, until):
     heard, damaged = [], keys / "clients" / "operator"
     good = damaged.read_bytes()
     with Publisher(TRACKS, place()) as tracks:
@@ -227,7 +218,7 @@ def test_a_client_is_allowed_and_revoked_without_a_restart_unless_a_file_is_dama
             until(lambda: False, lambda: (tracks.send(track(2)), reader.receive(0.02)))
 
 
-def test_a_key_of_one_pipeline_is_not_valid_for_another_of_the_same_program(place, keys, folder, until):
+def test_key_of_one_pipeline_is_not_valid_for_another(place, keys, folder, until):
     (folder / "sockets").mkdir(mode=0o700)
     other = Endpoint.parse(str(folder / "sockets"), str(folder / "wrong"))
     known = replace(Keys.load(keys), server=other.keys.server)

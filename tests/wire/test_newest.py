@@ -1,4 +1,4 @@
-"""Published messages about several objects: each subscriber gets those of its object, and each object's newest."""
+"""Published messages about several objects: each subscriber receives the newest message of each."""
 
 import signal
 import threading
@@ -33,7 +33,7 @@ def joined(publisher, count, until):
 @example("", "anna")
 @example("a" * 31, "a" * 32)
 @example("é" * 20, "é" * 64)
-def test_a_message_begins_with_the_topic_of_its_object_and_of_no_other(name, other):
+def test_message_begins_with_the_topic_of_its_object_only(name, other):
     data = encode(track(1, name))
     assert data.startswith(opening(Track))
     assert data.startswith(opening(Track, name))
@@ -42,7 +42,7 @@ def test_a_message_begins_with_the_topic_of_its_object_and_of_no_other(name, oth
     assert not data.startswith(opening(Model, name))
 
 
-class Turns(RuleBasedStateMachine):
+class Arrivals(RuleBasedStateMachine):
     """A subscriber to models at which messages arrive and are sometimes read; the socket is a queue in memory."""
 
     def __init__(self):
@@ -78,7 +78,7 @@ class Turns(RuleBasedStateMachine):
 
     @rule()
     def one_is_read(self):
-        """The newest of the object that has waited longest; none twice."""
+        """The newest message of the object that has waited longest is received, and no message twice."""
         expected = None
         for name in sorted(self.since, key=self.since.get):
             del self.since[name]
@@ -91,7 +91,7 @@ class Turns(RuleBasedStateMachine):
             self.received[expected[0]] = expected[1]
 
     @invariant()
-    def one_message_of_each_object_is_kept_at_most(self):
+    def at_most_one_message_of_each_object_is_stored(self):
         assert len(self.subscriber._arrived) <= len(self.newest)
 
     def teardown(self):
@@ -100,44 +100,43 @@ class Turns(RuleBasedStateMachine):
         self.folder.__exit__(None, None, None)
 
 
-TestTurns = Turns.TestCase
-TestTurns.settings = settings(max_examples=60, stateful_step_count=40)
+TestArrivals = Arrivals.TestCase
+TestArrivals.settings = settings(max_examples=60, stateful_step_count=40)
 
 
-def heard_by_all(publisher, subscriber, count, until):
-    """The version of the last message of each object, once so many objects were heard."""
-    heard = {}
+def newest_versions(publisher, subscriber, count, until):
+    """The version of the last message of each object, once messages of so many objects were received."""
+    versions = {}
 
     def turn():
         publisher.serve_late_joiners()
-        heard.update({message.object: message.version for message in subscriber.receive_all()})
+        versions.update({message.object: message.version for message in subscriber.receive_all()})
 
-    until(lambda: len(heard) == count, turn)
-    return heard
+    until(lambda: len(versions) == count, turn)
+    return versions
 
 
-def test_a_late_joiner_receives_the_newest_model_of_each_object_still_tracked(endpoint, until):
+def test_late_joiner_receives_the_newest_model_of_each_object(endpoint, until):
     with Publisher(MODELS, endpoint) as models:
         for version, name in enumerate(["anna", "ben", "anna", "", "ben"], 1):
             models.send(model(version, name))
         with Subscriber(MODELS, endpoint) as late:
-            assert heard_by_all(models, late, 3, until) == {"anna": 3, "": 4, "ben": 5}
+            assert newest_versions(models, late, 3, until) == {"anna": 3, "": 4, "ben": 5}
         with Subscriber(MODELS, endpoint, Model, about="anna") as late:
-            assert heard_by_all(models, late, 1, until) == {"anna": 3}
+            assert newest_versions(models, late, 1, until) == {"anna": 3}
         models.keep_only(["anna", "carl"])
         models.send(model(6, "carl"))
         with Subscriber(MODELS, endpoint) as late:
-            assert heard_by_all(models, late, 2, until) == {"anna": 3, "carl": 6}
+            assert newest_versions(models, late, 2, until) == {"anna": 3, "carl": 6}
 
 
-def test_after_the_end_a_late_joiner_receives_only_the_end(endpoint, until):
+def test_late_joiner_after_the_end_receives_only_the_end(endpoint, until):
+    end = End(1, "the source has ended")
     with Publisher(SAMPLES, endpoint) as samples:
         samples.send(sample(1, "anna"))
-        samples.send(End(1, "the source has ended"))
+        samples.send(end)
         with Subscriber(SAMPLES, endpoint) as late:
-            heard = []
-            until(lambda: heard, lambda: (samples.serve_late_joiners(), heard.extend(late.receive_all())))
-    assert heard == [End(1, "the source has ended")]
+            assert until(lambda: late.receive_all(0.01), samples.serve_late_joiners) == [end]
 
 
 def sample(version, name, width=5):
@@ -146,21 +145,21 @@ def sample(version, name, width=5):
     return Sample(version, 0, {"object": tree, "background": tree, "loss": loss}, np.empty((0, 2)), name)
 
 
-def test_of_a_burst_that_no_queue_holds_the_newest_of_each_object_still_arrives(endpoint, until):
+def test_newest_of_each_object_arrives_after_a_large_burst(endpoint, until):
     objects = 3 * SAMPLES.high_water_mark
     with Publisher(SAMPLES, endpoint) as samples, Subscriber(SAMPLES, endpoint) as trainer:
         joined(samples, 1, until)
         for version in range(1, objects + 1):  # nothing is read meanwhile
             samples.send(sample(version, f"o{version}", width=500))
-        heard = heard_by_all(samples, trainer, objects, until)
-    assert heard == {f"o{version}": version for version in range(1, objects + 1)}
+        received = newest_versions(samples, trainer, objects, until)
+    assert received == {f"o{version}": version for version in range(1, objects + 1)}
 
 
 class _InterruptError(Exception):
     pass
 
 
-def test_an_interrupt_is_not_lost_while_messages_are_received(endpoint, until):
+def test_interrupt_is_not_lost_while_messages_are_received(endpoint, until):
     """If one were lost, as in the destructor of a zmq.Frame, Python would warn that it ignores an exception."""
     raises, ended, interrupts = False, threading.Event(), 0
 
@@ -197,7 +196,7 @@ def test_an_interrupt_is_not_lost_while_messages_are_received(endpoint, until):
             signal.signal(signal.SIGUSR1, before)
 
 
-def test_a_publisher_remembers_the_last_messages_of_a_limited_number_of_names(endpoint, monkeypatch):
+def test_publisher_remembers_messages_of_at_most_256_names(endpoint, monkeypatch):
     monkeypatch.setattr(newest, "monotonic", lambda: 0.0)  # none is repeated meanwhile
     with Publisher(MODELS, endpoint) as models:
         for version in range(1, 600):
@@ -205,22 +204,22 @@ def test_a_publisher_remembers_the_last_messages_of_a_limited_number_of_names(en
         assert list(models._last) == [("model", f"o{version}") for version in range(344, 600)]
 
 
-def test_a_subscriber_remembers_a_limited_number_of_names_and_receives_all_messages():
-    turns = Turns()
+def test_subscriber_remembers_at_most_1024_names():
+    arrivals = Arrivals()
     try:
-        turns.queue.extend(encode(model(version, f"o{version}")) for version in range(1, 1500))
-        turns.queue.append(b"no message" * 100)
+        arrivals.queue.extend(encode(model(version, f"o{version}")) for version in range(1, 1500))
+        arrivals.queue.append(b"no message" * 100)
         versions = []
-        while (message := turns.subscriber.receive(0)) is not None:
+        while (message := arrivals.subscriber.receive(0)) is not None:
             versions.append(message.version)
-            assert len(turns.subscriber._arrived) <= 256
-            assert len(turns.subscriber._last) <= 1024
+            assert len(arrivals.subscriber._arrived) <= 256
+            assert len(arrivals.subscriber._last) <= 1024
     finally:
-        turns.teardown()
+        arrivals.teardown()
     assert versions == list(range(1, 1500))
 
 
-def test_a_flood_of_subscriptions_is_counted_and_the_others_are_served(endpoint, until):
+def test_flood_of_subscriptions_is_counted_and_others_are_served(endpoint, until):
     before = rejected()
     with Publisher(TRACKS, endpoint) as tracks, Subscriber(TRACKS, endpoint) as honest:
         joined(tracks, 1, until)

@@ -1,14 +1,13 @@
-"""Channels between sockets: what arrives when one side dies, dawdles, or is a stranger."""
+"""Channels between sockets: what arrives if one side dies or closes early, and the limits of the system."""
 
 import resource
-import select
 import socket
 import subprocess
 import sys
-import time
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -33,43 +32,13 @@ def tracks(seq):
     return Tracks(seq - 1, {"": track(seq)})
 
 
-def test_a_message_that_is_too_large_to_arrive_is_an_error_that_says_what_to_give(endpoint):
+def test_message_above_the_limit_of_its_channel_is_an_error(endpoint):
     small = replace(RESULTS, megabytes=0)
     with Sender(small, endpoint, WINDOW) as sender, pytest.raises(ServiceError, match=r"lower coreset\.size"):
         sender.send(tracks(1))
 
 
-#: Takes nothing while its queue is full and the sender dies, for longer than any timer of ZeroMQ.
-BUSY_RECEIVER = """
-import sys, time
-from catstream.wire.messages import Position
-from catstream.wire.acknowledged import Receiver
-from catstream.wire.channels import RESULTS
-from catstream.wire.endpoint import Endpoint
-with Receiver(RESULTS, Endpoint.parse(sys.argv[1]), Position(), 1) as receiver:
-    print("ready", flush=True)
-    receiver._socket.poll()
-    print("arrived", flush=True)
-    sys.stdin.readline()
-    time.sleep(1.5)
-    message = receiver.receive(60) or receiver.receive(60)  # a sender that had to wait asks for the position first
-    print(message.seq)
-"""
-
-
-def test_a_receiver_with_a_full_queue_survives_its_sender(endpoint, until):
-    command = [sys.executable, "-c", BUSY_RECEIVER, str(endpoint)]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as busy:
-        assert busy.stdout.readline() == "ready\n"
-        with Sender(RESULTS, endpoint, 8) as sender:
-            for seq in range(1, 9):
-                sender.send(tracks(seq))
-            until(lambda: select.select([busy.stdout], [], [], 0)[0], lambda: sender.poll(0.1))
-        assert busy.communicate("gone\n", timeout=500)[0] == "arrived\n1\n"
-    assert busy.returncode == 0
-
-
-def test_a_late_subscriber_receives_no_old_tracks(endpoint, until):
+def test_late_subscriber_receives_no_old_tracks(endpoint, until):
     with Publisher(TRACKS, endpoint) as publisher:
         publisher.send(track(1))
         with Subscriber(TRACKS, endpoint) as late:
@@ -78,36 +47,31 @@ def test_a_late_subscriber_receives_no_old_tracks(endpoint, until):
     assert got[0].seq > 1
 
 
-def test_the_last_message_arrives_even_if_its_sender_closes_at_once(endpoint, until):
+def test_last_message_arrives_if_its_sender_closes_at_once(endpoint, until):
     tree, loss = (Summary(np.ones((200, d), np.float32), np.ones(d, np.float32), 200, (0,)) for d in (2000, 2002))
     large = Sample(1, 0, {"object": tree, "background": tree, "loss": loss}, np.empty((0, 2)))
-
-    def run():
-        heard = []
+    for _ in range(10):  # a race, as in the next test
+        received = []
         with Subscriber(SAMPLES, endpoint) as reader, Publisher(SAMPLES, endpoint) as samples:
             samples.send(large)
-            until(lambda: reader.receive(0.05), samples.serve_late_joiners)
+            until(partial(reader.receive, 0.05), samples.serve_late_joiners)
             samples.send(large)
             samples.send(End(0, "it was the last"))
             samples.close()
-            until(lambda: heard and isinstance(heard[-1], End), lambda: heard.extend(reader.receive_all()))
-
-    for _ in range(10):  # a race, as the next
-        run()
+            while not (received and isinstance(received[-1], End)):
+                received += reader.receive_all(0.05)
 
 
-def test_a_sender_learns_that_its_end_is_stored_though_the_receiver_closes_at_once(endpoint, until):
-    def run():
+def test_sender_learns_that_its_end_is_stored_if_receiver_closes(endpoint, until):
+    for _ in range(10):
         with ThreadPoolExecutor(1) as pool, Sender(RESULTS, endpoint, WINDOW) as sender:
             receiver = Receiver(RESULTS, endpoint, Position(), WINDOW)
             sender.send(End(0, "it was the last"))
-            until(lambda: receiver.receive(0.05), lambda: sender.poll(0))
+            until(partial(receiver.receive, 0.05), partial(sender.poll, 0))
             receiver.acknowledge(Position(1))
             pool.submit(receiver.close)
-            until(lambda: sender.window.stored == 1, lambda: sender.poll(0.02))
-
-    for _ in range(10):  # a race, which was lost every other time
-        run()
+            while not sender.window.stored:
+                sender.poll(0.02)
 
 
 def test_ipv6_loopback_is_an_endpoint(until):
@@ -121,7 +85,7 @@ def test_ipv6_loopback_is_an_endpoint(until):
         until(lambda: reader.receive(0.01) is not None, lambda: models.send(model(1)))
 
 
-def test_sockets_that_are_dropped_without_close_do_not_block_the_io_thread(endpoint):
+def test_sockets_without_close_do_not_block_the_io_thread(endpoint):
     with Publisher(TRACKS, endpoint):
         dropped = [Subscriber(TRACKS, endpoint) for _ in range(10)]
         with pytest.warns(ResourceWarning, match="not closed"):
@@ -147,7 +111,7 @@ def open_files(until):
     until(lambda: count() <= before + 10)  # ZeroMQ closes its files some time later
 
 
-def test_a_program_may_have_as_many_sockets_as_files(open_files):
+def test_program_may_have_as_many_sockets_as_files(open_files):
     open_files(1200)
     with ExitStack() as stack:
         assert all(stack.enter_context(context().socket(zmq.PAIR)) for _ in range(1100))
@@ -176,15 +140,13 @@ with Sender(ALL_FEATURES, Endpoint.parse(sys.argv[1]), 64) as features:
 """
 
 
-def test_a_process_that_ends_with_queued_messages_ends_normally(folder):
-    place = Endpoint.parse(str(folder))
+def test_process_with_queued_messages_ends_normally(folder):
     with zmq.Context.instance().socket(zmq.ROUTER) as receiver:
         receiver.set(zmq.LINGER, 0)
         receiver.set(zmq.RCVHWM, 1)
-        receiver.bind(place.listening(ALL_FEATURES))
+        receiver.bind(Endpoint.parse(str(folder)).listening(ALL_FEATURES))
         with subprocess.Popen([sys.executable, "-c", SENDER, str(folder)], stderr=subprocess.PIPE) as sender:
             while sender.poll() is None:
-                time.sleep(0.02)
-                if receiver.poll(0):
+                if receiver.poll(20):
                     receiver.recv_multipart()
             assert sender.returncode == 0, sender.stderr.read().decode()

@@ -1,4 +1,4 @@
-"""What a stranger sends on any channel is counted by what is wrong with it, and dropped: nothing is trusted."""
+"""Messages from strangers on any channel are counted by their cause and dropped."""
 
 import socket
 from contextlib import closing
@@ -17,6 +17,7 @@ from catstream.wire.messages import End, Features, Health, ObjectFeatures, Posit
 from catstream.wire.monitor import Event, Monitor
 from catstream.wire.newest import Publisher, Subscriber
 from catstream.wire.rejects import rejected
+from tests.wire.examples import example, track
 
 WINDOW = 4
 PUBLISHED = [name for name, channel in CHANNELS.items() if channel.receiver is None]
@@ -27,7 +28,7 @@ def features(seq, width=5):
     return Features(seq - 1, 0.0, {"anna": ObjectFeatures(None, training)})
 
 
-#: What may be wrong with a message of features: test_codec.py has all that its schema does not allow.
+#: Invalid messages of features by their cause; test_codec.py has all violations of the schema.
 WRONG = {
     "msgpack": [b"GET / HTTP/1.1"],
     "envelope": [msgpack.packb({"frame": 1})],
@@ -39,76 +40,71 @@ WRONG = {
 }
 
 
-@pytest.mark.parametrize("what", WRONG)
-def test_an_invalid_message_is_counted_and_does_not_affect_the_legitimate_sender(what, endpoint, stranger, until):
-    forest, before, taken = Forest(Settings(coreset={"size": 2})), rejected(), []
+@pytest.mark.parametrize("wrong", WRONG)
+def test_invalid_message_is_counted_and_affects_no_sender(wrong, endpoint, stranger, until):
+    forest, before, received = Forest(Settings(coreset={"size": 2})), rejected(), []
     with (
         Receiver(ALL_FEATURES, endpoint, Position(), WINDOW, check=forest.check_features) as receiver,
         Sender(ALL_FEATURES, endpoint, WINDOW) as sender,
     ):
 
         def turn():
-            sender.send(features(sender.window.sent + 1)) if sender.window.sent < len(taken) + 1 else sender.poll(0.01)
+            if sender.window.sent <= len(received):
+                sender.send(features(sender.window.sent + 1))
+            sender.poll(0.01)
             if (message := receiver.receive(0.01)) is not None:
-                taken.append(message.seq)
+                received.append(message.seq)
                 forest.take(message)
                 receiver.acknowledge(Position(message.seq))
 
         until(lambda: sender.window.stored >= 1, turn)
-        stranger(zmq.DEALER, "all-features").send_multipart(WRONG[what])
+        stranger(zmq.DEALER, "all-features").send_multipart(WRONG[wrong])
         until(lambda: rejected() == before + 1, turn)
         until(lambda: sender.window.stored > 5, turn)
-    assert taken == list(range(1, len(taken) + 1)), "each once, in order"
-    assert forest.seq == taken[-1]
+    assert received == list(range(1, len(received) + 1)), "each once, in order"
+    assert forest.seq == received[-1]
 
 
-def test_acknowledgements_are_sent_only_to_the_sender_of_the_accepted_message(endpoint, stranger, until):
-    taken = []
+def test_replies_to_a_stranger_do_not_redirect_acknowledgements(endpoint, stranger, until):
+    received = []
     with Receiver(RESULTS, endpoint, Position(), WINDOW) as receiver, Sender(RESULTS, endpoint, WINDOW) as sender:
         other = stranger(zmq.DEALER, "results")
 
         def turn():
             if (message := receiver.receive(0.01)) is not None:
-                taken.append(message.seq)
+                received.append(message.seq)
             sender.poll(0)
 
         sender.send(End(0, "the source has ended"))
-        until(lambda: taken == [1], turn)
-        other.send(b"")
-        until(lambda: other.poll(0), turn)
-        other.recv()
-        other.send(encode(End(0, "replayed")))
-        until(lambda: other.poll(0), turn)
-        other.recv()
+        until(lambda: received == [1], turn)
+        for question in (b"", encode(End(0, "replayed"))):
+            other.send(question)
+            until(lambda: other.poll(0), turn)
+            other.recv()
         receiver.acknowledge(Position(1))  # stored only now
         until(lambda: sender.window.stored == 1, lambda: sender.poll(0.01))
         assert not other.poll(50)
 
 
 @pytest.mark.parametrize("name", PUBLISHED)
-def test_messages_to_a_publisher_are_counted_and_do_not_affect_its_subscribers(
-    name, endpoint, stranger, message_of, until
-):
-    said = message_of(name)
-    before, heard = rejected(), []
-    with (
-        Publisher(CHANNELS[name], endpoint, CHANNELS[name].senders[0]) as publisher,
-        Subscriber(CHANNELS[name], endpoint) as reader,
-    ):
+def test_message_to_a_publisher_is_counted_and_affects_no_subscriber(name, endpoint, stranger, until):
+    message, before, received = example(CHANNELS[name].messages[0]), rejected(), []
+    channel = CHANNELS[name]
+    with Publisher(channel, endpoint, channel.senders[0]) as publisher, Subscriber(channel, endpoint) as reader:
         other = stranger(zmq.XSUB, name)
         for junk in (b"GET / HTTP/1.1", b"\x01topic", encode(End(8, "forged"))):
             other.send(junk)
         other.send(b"\x01" + bytes(10_000))  # above the limit: ZeroMQ ends the connection
         until(
-            lambda: rejected() >= before + 3 and heard,
-            lambda: (publisher.send(said), heard.extend(reader.receive_all())),
+            lambda: rejected() >= before + 3 and received,
+            lambda: (publisher.send(message), received.extend(reader.receive_all())),
         )
-    assert {type(message) for message in heard} == {type(said)}
+    assert {type(each) for each in received} == {type(message)}
 
 
 @pytest.mark.parametrize("sent", [b"", b"\xff" + bytes(8) + b"\x7f"], ids=["nothing", "a part of the greeting"])
-def test_a_client_that_leaves_during_its_handshake_is_not_counted(sent, endpoint, message_of, until):
-    before, heard = rejected(), []
+def test_client_that_leaves_during_its_handshake_is_not_counted(sent, endpoint, until):
+    before = rejected()
     address = endpoint.address(CHANNELS["tracks"]).partition("://")[2]
     if endpoint.folder is None:
         host, _, port = address.partition(":")
@@ -119,12 +115,12 @@ def test_a_client_that_leaves_during_its_handshake_is_not_counted(sent, endpoint
                 leaving.connect(address)
                 leaving.sendall(sent)
         with Subscriber(CHANNELS["tracks"], endpoint) as reader:
-            until(lambda: heard, lambda: (publisher.send(message_of("tracks")), heard.extend(reader.receive_all(0.01))))
+            until(lambda: reader.receive(0.01), lambda: publisher.send(track(1)))
         assert rejected() == before
 
 
-def test_a_message_above_the_size_limit_closes_its_connection_unread(endpoint, stranger, until):
-    before, taken = rejected(), []
+def test_message_above_the_size_limit_closes_its_connection_unread(endpoint, stranger, until):
+    before = rejected()
     with Receiver(RESULTS, endpoint, Position(), WINDOW) as receiver, Sender(RESULTS, endpoint, WINDOW) as sender:
         other = stranger(zmq.DEALER, "results")
         with closing(Monitor(other)) as events:
@@ -132,11 +128,5 @@ def test_a_message_above_the_size_limit_closes_its_connection_unread(endpoint, s
             until(lambda: Event.DISCONNECTED in events.events(0.05), lambda: receiver.receive(0))
             other.disable_monitor()
         sender.send(End(0, "the source has ended"))
-
-        def turn():
-            sender.poll(0)
-            if (message := receiver.receive(0.05)) is not None:
-                taken.append(message.seq)
-
-        until(lambda: taken, turn)
-    assert (taken, rejected()) == ([1], before)
+        assert until(lambda: receiver.receive(0.05), lambda: sender.poll(0)).seq == 1
+    assert rejected() == before
