@@ -20,7 +20,7 @@ CAM = StreamStatus("cam-7", "running", "north", "walk.mp4", "run", token=3)
 SITE = FleetStatus("site", 1.7e9, {"cam-7": CAM}, {"north": NodeStatus("north", "alive")})
 
 
-def test_a_fleet_of_thousands_of_streams_arrives_whole(managing):
+def test_state_of_thousands_of_streams_arrives_whole(managing):
     streams = {name: replace(CAM, name=name, trouble="x" * 500) for name in (f"cam-{n}" for n in range(10_000))}
     many = FleetStatus("site", 1.7e9, streams, {f"n-{n}": NodeStatus(f"n-{n}", "alive") for n in range(300)})
     with managing(many), Registry() as registry:
@@ -31,7 +31,7 @@ def test_a_fleet_of_thousands_of_streams_arrives_whole(managing):
 
 
 @pytest.mark.parametrize("answer", [b"{}", b'{"name": 3', b"{" + b'"a": [' * 100_000])
-def test_an_answer_that_is_no_state_of_a_fleet_is_an_error(folder, answer):
+def test_invalid_answer_of_a_registry_is_an_error(folder, answer):
     with (
         reserve_endpoint("", folder, fleet="site") as place,
         Responder[Question, Listing](REGISTRY, place) as responder,
@@ -48,7 +48,7 @@ def test_an_answer_that_is_no_state_of_a_fleet_is_an_error(folder, answer):
             served.result()
 
 
-def test_a_fleet_is_no_pipeline_and_a_pipeline_is_no_fleet(folder, managing):
+def test_discovery_separates_fleets_and_pipelines(folder, managing):
     with managing(SITE) as controller, reserve_endpoint("", folder, source="walk.mp4") as pipeline:
         assert fleets() == {"site": controller}
         assert running() == [pipeline]
@@ -59,28 +59,26 @@ def test_a_fleet_is_no_pipeline_and_a_pipeline_is_no_fleet(folder, managing):
     assert fleets() == {}
 
 
-def test_of_several_fleets_the_name_selects_one(managing):
-    with managing(SITE), managing(replace(SITE, name="yard")):
-        with Registry("yard") as registry:
-            assert registry.streams().name == "yard"
-        with pytest.raises(ServiceError, match=r"2 fleets are running: select one .* site, yard"):
-            Registry()
-
-
-def test_without_a_fleet_the_error_says_how_to_get_one(managing):
+def test_fleet_is_selected_by_its_name_if_several_run(managing):
     with pytest.raises(ServiceError, match=r"no fleet of yours is running: start it \(catstream fleet up\)"):
         Registry()
-    with managing(SITE), pytest.raises(ServiceError, match=r"no fleet 'yard' of yours is running, only site"):
-        Registry("yard")
+    with managing(SITE):
+        with pytest.raises(ServiceError, match=r"no fleet 'yard' of yours is running, only site"):
+            Registry("yard")
+        with managing(replace(SITE, name="yard")):
+            with Registry("yard") as registry:
+                assert registry.streams().name == "yard"
+            with pytest.raises(ServiceError, match=r"2 fleets are running: select one .* site, yard"):
+                Registry()
 
 
-def test_an_unknown_host_is_named_before_keys_are_asked_for(monkeypatch):
+def test_unknown_host_of_a_fleet_is_an_error_without_keys(monkeypatch):
     monkeypatch.setattr(socket, "getaddrinfo", Mock(side_effect=socket.gaierror))
     with pytest.raises(ServiceError, match="the host 'haed' of the fleet is unknown"):
         Address.parse("fleet://haed:5690/cam-7").resolve()
 
 
-def test_a_stream_allows_exactly_the_clients_of_its_fleet_and_its_own_processes(keys, folder):
+def test_stream_allows_the_clients_of_its_fleet(keys, folder):
     stream = folder / "stream"
     create(stream)
     own = clients(stream)["pipeline"]
