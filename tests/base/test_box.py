@@ -1,4 +1,4 @@
-"""Boxes, as people write them."""
+"""Boxes from texts and numbers."""
 
 import cv2
 import numpy as np
@@ -13,7 +13,7 @@ from catstream.errors import BoxError
     ["10,20,30,40", " 10 20\t30, 40", (10, 20, 30, 40), np.array([10, 20, 30, 40]), iter([10, 20, 30, 40])],
     ids=["commas", "blanks", "tuple", "array", "iterator"],
 )
-def test_a_box_is_parsed_from_a_text_and_from_any_four_numbers(value):
+def test_box_is_parsed_from_a_text_and_from_any_four_numbers(value):
     assert Box.parse(value) == Box(10.0, 20.0, 30.0, 40.0)
 
 
@@ -22,12 +22,10 @@ def test_a_box_is_parsed_from_a_text_and_from_any_four_numbers(value):
     ["10,20,30", "a,b,c,d", "", (10, 20, 30), [[1, 2], [3, 4]], None, 7, (10, 20, None, 40), np.zeros((480, 640, 3))],
     ids=lambda value: repr(value)[:9],
 )
-def test_anything_but_four_numbers_is_one_line_of_error_with_an_example(value):
-    said = r"a box is four numbers x,y,w,h in pixels, got .*: for example 120,80,64,48"
-    with pytest.raises(BoxError, match=said) as told:
+def test_invalid_box_is_a_short_error_with_an_example(value):
+    message = r"a box is four numbers x,y,w,h in pixels, got .{,130}: for example 120,80,64,48$"
+    with pytest.raises(BoxError, match=message):
         Box.parse(value)
-    assert "\n" not in str(told.value)
-    assert len(str(told.value)) < 200
 
 
 def test_cv2_draws_a_rounded_box():

@@ -7,14 +7,14 @@ from catstream.base import clock
 from catstream.errors import SilenceError
 
 
-def test_a_clock_does_not_count_the_time_in_which_the_process_was_stopped(monkeypatch):
+def test_clock_skips_the_time_in_which_its_process_was_stopped(monkeypatch):
     moments = iter([1000.0, 1000.2, 1000.4, 4000.0, 4000.1])
     monkeypatch.setattr(clock, "monotonic", lambda: next(moments))
     running = clock.RunningClock()
     assert [running() for _ in range(4)] == pytest.approx([0.2, 0.4, 0.4 + clock.STEP_SECONDS, 1.0])
 
 
-def test_a_subscriber_that_was_stopped_waits_for_the_rest_of_its_timeout(folder, monkeypatch):
+def test_stopped_subscriber_waits_for_the_rest_of_its_timeout(folder, monkeypatch):
     looks = []
 
     def read():

@@ -25,7 +25,7 @@ def read(path):
 
 
 @pytest.mark.parametrize("form", FORMS.values(), ids=FORMS)
-def test_a_table_is_read_in_each_form(tmp_path, form):
+def test_table_is_read_in_each_form(tmp_path, form):
     (tmp_path / "t.csv").write_bytes(form)
     assert read(tmp_path / "t.csv") == [("cam.mp4", 40.5, 3), ("b", 7.0, 0)]
 
@@ -43,14 +43,14 @@ def test_a_table_is_read_in_each_form(tmp_path, form):
         ("name,x,frame\nZoë,1,2".encode("cp1252"), "(its text is not UTF-8): pass a CSV file with the columns name,x"),
     ],
 )
-def test_an_error_names_the_line_the_column_and_what_is_expected(tmp_path, rows, message):
+def test_error_names_the_line_and_the_column(tmp_path, rows, message):
     (tmp_path / "t.csv").write_bytes(rows)
     with pytest.raises(VideoError) as error:
         read(tmp_path / "t.csv")
     assert message in str(error.value)
 
 
-def test_a_table_is_read_as_it_was_written(tmp_path):
+def test_table_is_read_as_it_was_written(tmp_path):
     rows = [("a;b,c\td", 1.5, 2), ('"', -3.0, 0)]
     write_table(tmp_path / "new" / "t.csv", ("name", "x", "frame"), rows)
     assert read(tmp_path / "new" / "t.csv") == rows

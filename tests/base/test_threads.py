@@ -39,7 +39,7 @@ with one_thread():
 """
 
 
-def test_a_library_that_is_imported_inside_is_on_one_thread_too():
+def test_library_that_is_imported_inside_has_one_thread():
     environment = os.environ | dict.fromkeys(ONE_THREAD, "2")
     program = [sys.executable, "-c", FIRST_USE]
     said = subprocess.run(program, env=environment, capture_output=True, text=True, check=True)
@@ -47,7 +47,7 @@ def test_a_library_that_is_imported_inside_is_on_one_thread_too():
 
 
 @pytest.mark.usefixtures("two_threads")
-def test_all_libraries_use_one_thread_inside_and_as_many_as_before_after_it():
+def test_libraries_have_one_thread_only_inside():
     before = counts()
     with one_thread(), one_thread():
         assert set(counts().values()) == {1}
@@ -58,7 +58,7 @@ def test_all_libraries_use_one_thread_inside_and_as_many_as_before_after_it():
 
 
 @pytest.mark.usefixtures("two_threads")
-def test_the_last_of_two_threads_restores_the_number():
+def test_last_of_two_threads_restores_the_number():
     before, both, first_left = counts(), Barrier(2), Barrier(2)
 
     def first():
@@ -114,7 +114,7 @@ print(blake2b(catstream.merge(models).to_bytes()).hexdigest())
 FIRST, LAST = "", "import numpy, scipy.linalg, cv2, sklearn.linear_model\n"  # catstream is imported first, or last
 
 
-def test_a_model_has_the_same_bits_in_any_order_of_imports_and_on_any_number_of_cpus(demo_video):
+def test_models_have_the_same_bits_on_any_number_of_cpus(demo_video):
     cores = sorted(os.sched_getaffinity(0))
     if len(cores) < 2:
         pytest.skip("this machine has one core")

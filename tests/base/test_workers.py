@@ -13,7 +13,7 @@ import pytest
 from catstream.base.workers import Workers, run_tasks, sigint_blocked
 
 
-def test_ctrl_c_in_another_thread_interrupts_only_after_all_workers_were_started():
+def test_ctrl_c_interrupts_after_all_workers_were_started():
     started = []
 
     def start_all(other):
@@ -29,12 +29,12 @@ def test_ctrl_c_in_another_thread_interrupts_only_after_all_workers_were_started
     assert started == [0, 1]
 
 
-def test_ctrl_c_ends_no_worker_because_the_caller_does():
+def test_workers_ignore_ctrl_c():
     """A worker that ended on its own would be reported as killed, also by a caller that ignores Ctrl-C."""
     assert list(run_tasks(signal.raise_signal, [(signal.SIGINT,)] * 2, jobs=2)) == [None, None]
 
 
-def test_a_caller_that_stops_early_leaves_no_worker():
+def test_caller_that_stops_early_leaves_no_worker():
     results = run_tasks(abs, [(-1,), (-2,), (-3,)], jobs=2)
     assert next(results) in {1, 2, 3}
     running = multiprocessing.active_children()
@@ -45,9 +45,8 @@ def test_a_caller_that_stops_early_leaves_no_worker():
 
 def test_workers_are_started_again_after_a_caller_stopped_early():
     with closing(Workers(1)) as workers:
-        stopped = workers.run(os.getpid, [(), ()])
-        first = next(stopped)
-        stopped.close()
+        with closing(workers.run(os.getpid, [(), ()])) as stopped:
+            first = next(stopped)
         assert [*workers.run(os.getpid, [()])] != [first]
 
 
