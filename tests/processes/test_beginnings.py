@@ -1,4 +1,4 @@
-"""Which objects begin in a frame: those of the job, of commands, and of a resume."""
+"""The objects that begin in a frame: by the job, by commands, and by a resume."""
 
 from contextlib import closing
 from dataclasses import replace
@@ -55,7 +55,7 @@ def set_box(number, name, box=OTHER, **more):
     return Command(number, "set-box", box, object=name, **more)
 
 
-def test_the_object_of_the_job_begins_in_the_first_frame_alone(stream):
+def test_object_of_the_job_begins_in_the_first_frame_only(stream):
     assert [stream.frame() for _ in range(3)] == [["anna"], [], []]
 
 
@@ -75,7 +75,7 @@ def test_second_box_for_one_name_waits_for_the_next_frame(stream):
 
 
 @pytest.mark.parametrize("box", [Box(900, 900, 20, 20), Box(10, 10, 1, 1)], ids=["outside", "too small"])
-def test_an_invalid_box_is_rejected_and_nothing_begins(stream, box):
+def test_invalid_box_is_rejected_and_begins_no_object(stream, box):
     stream.frame()
     stream.commands.boxes.append(set_box("1", "ben", box))
     assert stream.frame() == []
@@ -83,7 +83,7 @@ def test_an_invalid_box_is_rejected_and_nothing_begins(stream, box):
     assert list(stream.commands.desired.objects) == ["anna"]
 
 
-def test_a_pause_with_a_limit_ends_by_itself(stream, monkeypatch):
+def test_pause_with_a_limit_ends_by_itself(stream, monkeypatch):
     now = [100.0]
     monkeypatch.setattr("catstream.processes.commands.monotonic", lambda: now[0])
     assert stream.commands._execute(Command("1", "pause", seconds=30.0)).done
@@ -101,7 +101,7 @@ def test_run_resumes_with_its_original_boxes_if_its_state_is_torn(folder, tmp_pa
         assert "cannot read the desired state" in process.trouble
 
 
-def test_a_desired_state_that_cannot_be_written_is_trouble_until_a_later_attempt_succeeds(stream, monkeypatch):
+def test_unwritable_desired_state_is_written_later(stream, monkeypatch):
     now = [100.0]
     monkeypatch.setattr("catstream.processes.commands.monotonic", lambda: now[0])
     commands, process = stream.commands, stream.commands._process
@@ -118,7 +118,7 @@ def test_a_desired_state_that_cannot_be_written_is_trouble_until_a_later_attempt
     assert (DesiredState.load(file).paused, process.trouble) == (True, "")
 
 
-def test_resumed_object_without_a_state_begins_again_where_it_was(stream):
+def test_resumed_object_without_a_state_begins_again(stream):
     objects = {"anna": DesiredObject(BOX, begins=8), "ben": DesiredObject(OTHER, begins=20)}
     start = Start(7, 7, DesiredState(objects), {})
     stream.detectors.seq = start.seq

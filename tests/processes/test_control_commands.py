@@ -1,4 +1,4 @@
-"""What each command changes, and what it is answered."""
+"""The changes of each command to the desired state, and its answer."""
 
 from dataclasses import replace
 
@@ -50,22 +50,22 @@ def test_pause_resume_and_stop_change_one_thing_each(tracked):
     assert execute(command("pause"), before, tracked)[1].reason == "paused before the first frame"
 
 
-def test_a_pause_with_a_limit_is_not_kept_and_changes_no_pause_without_one(tracked):
-    until_resume, told = replace(desired("anna"), paused=True), {}
-    for before in (desired("anna"), until_resume):
-        for seconds in (30.0, 0.0):
-            after, answer = execute(command("pause", seconds=seconds), before, tracked)
-            assert after == before
-            told[before.paused, seconds] = answer.reason
-    assert told == {
-        (False, 30.0): "paused for 30 s after frame 6",
-        (False, 0.0): "resumed after frame 6",
-        (True, 30.0): "paused after frame 6",
-        (True, 0.0): "paused after frame 6",
-    }
+@pytest.mark.parametrize(
+    ("paused", "seconds", "reason"),
+    [
+        (False, 30.0, "paused for 30 s after frame 6"),
+        (False, 0.0, "resumed after frame 6"),
+        (True, 30.0, "paused after frame 6"),
+        (True, 0.0, "paused after frame 6"),
+    ],
+)
+def test_pause_with_a_limit_does_not_change_the_desired_state(tracked, paused, seconds, reason):
+    before = replace(desired("anna"), paused=paused)
+    after, answer = execute(command("pause", seconds=seconds), before, tracked)
+    assert (after, answer.reason) == (before, reason)
 
 
-def test_a_search_begins_its_object_in_the_next_frame_in_the_place_of_another_one(tracked):
+def test_search_replaces_its_object_from_the_next_frame_on(tracked):
     after, answer = execute(command("search", "anna"), desired("anna", "ben"), tracked, SAVED)
     assert after.objects == {"ben": DesiredObject(BOX, 1), "anna": replace(SAVED, begins=8)}
     assert answer.reason == "anna is searched for from frame 7 on, by model 5"
@@ -81,12 +81,12 @@ def test_a_search_begins_its_object_in_the_next_frame_in_the_place_of_another_on
     ],
     ids=["too many", "which one", "no model", "too large"],
 )
-def test_a_search_that_is_not_possible_is_an_error(tracked, names, name, model, error):
+def test_impossible_search_is_an_error(tracked, names, name, model, error):
     with pytest.raises(error):
         execute(command("search", name), desired(*names), tracked, model)
 
 
-def test_a_forgotten_object_is_gone_and_without_any_the_run_waits(tracked):
+def test_run_waits_for_a_box_after_its_last_object_is_forgotten(tracked):
     after, answer = execute(command("forget", "ben"), desired("anna", "ben"), tracked)
     assert after == desired("anna")
     assert (answer.object, answer.reason) == ("ben", "ben is no longer tracked after frame 6")
@@ -97,7 +97,7 @@ def test_a_forgotten_object_is_gone_and_without_any_the_run_waits(tracked):
 
 @pytest.mark.parametrize("verb", ["forget", "save"])
 @pytest.mark.parametrize(("names", "name"), [((), ""), (("anna",), "ben"), (("anna", "ben"), "")])
-def test_a_command_for_an_object_that_is_not_there_is_an_error(tracked, verb, names, name):
+def test_command_for_an_unknown_object_is_an_error(tracked, verb, names, name):
     with pytest.raises(CatstreamError, match=r"no object|ambiguous object"):
         execute(command(verb, name), desired(*names), tracked)
 
@@ -106,22 +106,34 @@ def test_a_command_for_an_object_that_is_not_there_is_an_error(tracked, verb, na
     ("name", "done", "reason"),
     [("anna", True, "model 4 after"), ("ben", False, "nothing was learned"), ("carl", False, "was not found yet")],
 )
-def test_only_what_was_learned_can_be_saved(tracked, name, done, reason):
+def test_object_without_a_model_or_detection_is_not_saved(tracked, name, done, reason):
     before = desired("anna", "ben", "carl")
     after, answer = execute(command("save", name), before, tracked)
     assert (after, answer.done, answer.frame) == (before, done, 6)
     assert answer.reason.startswith(reason) or reason in answer.reason
 
 
-def test_a_box_is_for_the_only_object_and_continues_it_only_if_it_has_a_model(tracked):
+def test_box_without_a_name_is_for_the_only_object():
     assert object_of(command("set-box"), desired("anna")) == "anna"
     assert object_of(command("set-box"), desired("", "anna")) == object_of(command("set-box"), desired()) == ""
-    check_room("anna", desired("anna", "b", "c", "d"), 4)
+
+
+def test_object_beyond_the_limit_is_an_error():
+    four = desired("anna", "b", "c", "d")
+    check_room("anna", four, 4)
     with pytest.raises(ObjectError):
-        check_room("e", desired("anna", "b", "c", "d"), 4)
-    both = desired("anna", "ben")
-    assert continues(command("set-box", keep=True), "anna", both, tracked)
-    assert not continues(command("set-box", keep=True), "ben", both, tracked)
-    assert not continues(command("set-box"), "anna", both, tracked)
-    another = both.with_object("anna", DesiredObject(BOX, 8))
-    assert not continues(command("set-box", keep=True), "anna", another, tracked), "it begins with the next frame"
+        check_room("e", four, 4)
+
+
+@pytest.mark.parametrize(
+    ("name", "keep", "begins", "result"),
+    [
+        ("anna", True, 1, True),
+        pytest.param("ben", True, 1, False, id="it has no model"),
+        pytest.param("anna", False, 1, False, id="not requested"),
+        pytest.param("anna", True, 8, False, id="it begins with the next frame"),
+    ],
+)
+def test_box_continues_an_object_with_a_model(tracked, name, keep, begins, result):
+    state = DesiredState({each: DesiredObject(BOX, begins) for each in ("anna", "ben")})
+    assert continues(command("set-box", keep=keep), name, state, tracked) == result

@@ -29,20 +29,20 @@ VERSIONS = st.dictionaries(NAMES, st.integers(1, 9))
 
 
 @given(DESIRED)
-def test_a_desired_state_is_read_as_it_was_written(tmp_path_factory, desired):
+def test_desired_state_is_read_as_it_was_written(tmp_path_factory, desired):
     file = tmp_path_factory.mktemp("state") / "desired_state.json"
     desired.save(file)
     assert DesiredState.load(file) == desired
 
 
 @pytest.mark.parametrize("torn", ["", "{", "null", '{"objects": {"": [1, 2]}}'], ids=repr)
-def test_a_torn_desired_state_is_an_error(tmp_path, torn):
+def test_torn_desired_state_is_an_error(tmp_path, torn):
     (tmp_path / "desired_state.json").write_text(torn)
     with pytest.raises(ProtocolError, match="cannot read the desired state"):
         DesiredState.load(tmp_path / "desired_state.json")
 
 
-def test_a_desired_state_is_on_disk_before_it_replaces_the_old_one(tmp_path, monkeypatch):
+def test_desired_state_is_on_disk_before_it_replaces_another(tmp_path, monkeypatch):
     done = []
     for module, name in ((os, "fsync"), (Path, "replace")):
         call = getattr(module, name)
@@ -52,7 +52,7 @@ def test_a_desired_state_is_on_disk_before_it_replaces_the_old_one(tmp_path, mon
 
 
 @given(DESIRED, NAMES, st.integers(1, 30))
-def test_a_new_object_is_the_last_one_and_forgetting_one_keeps_the_order_of_others(desired, name, seq):
+def test_objects_stay_in_the_order_of_their_beginning(desired, name, seq):
     others = [other for other in desired.objects if other != name]
     begun = desired.with_object(name, DesiredObject(BOX, seq))
     assert [*begun.objects] == [*others, name]
@@ -60,9 +60,7 @@ def test_a_new_object_is_the_last_one_and_forgetting_one_keeps_the_order_of_othe
 
 
 @given(DESIRED, SEQ, SEQ | st.none(), VERSIONS, st.sets(NAMES), st.booleans())
-def test_a_restarted_detector_loses_no_frame_and_learns_from_none_twice(
-    desired, processed, after, versions, known, live
-):
+def test_restarted_detector_repeats_and_loses_no_frame(desired, processed, after, versions, known, live):
     position = Position(processed, processed, versions=versions, states=dict.fromkeys(known, STATE))
     start = resume_at(position, after, desired, live=live)
     assert start.seq <= processed, "the compressor has all messages before"
@@ -71,7 +69,7 @@ def test_a_restarted_detector_loses_no_frame_and_learns_from_none_twice(
     if live:
         assert start.seq == processed, "frames of a live source are not read again"
     else:
-        assert after is None or start.seq <= after, "the owner has all frames before"
+        assert after is None or start.seq <= after, "the program has all frames before"
         assert start.repeats >= (after or 0)
         if versions:
             assert start.seq == (processed if after is None else min(after, processed))
@@ -82,7 +80,7 @@ def test_a_restarted_detector_loses_no_frame_and_learns_from_none_twice(
         assert replace(each, begins=0, box=BOX) == replace(desired.objects[name], begins=0, box=BOX)
 
 
-def test_an_object_of_which_nothing_was_learned_begins_again_where_it_was_last():
+def test_object_without_a_model_begins_again_at_its_last_box():
     desired = DesiredState({"anna": DesiredObject(BOX, 3), "ben": DesiredObject(BOX, 5)})
     position = Position(8, 8, versions={"anna": 2}, states={"anna": STATE, "ben": STATE})
     start = resume_at(position, 8, desired, live=False)
@@ -91,7 +89,7 @@ def test_an_object_of_which_nothing_was_learned_begins_again_where_it_was_last()
 
 
 @given(st.lists(st.tuples(st.integers(1, 3), VERSIONS), max_size=20), SEQ)
-def test_a_sample_counts_from_the_first_message_that_may_have_led_to_it(replies, seq):
+def test_sample_counts_from_the_first_message_before_it(replies, seq):
     """Each reply is some messages after the one before."""
     lag, processed, led_to = TrainingLag(), 0, {}
     for messages, versions in replies:
@@ -127,7 +125,7 @@ class Storing(RuleBasedStateMachine):
         self.position = stored(self.position, self.seq, saved=works, urgent=urgent)
 
     @invariant()
-    def what_a_sender_may_forget_is_on_disk_or_counted(self):
+    def acknowledged_messages_are_on_disk_or_counted(self):
         position = self.position
         assert position.seq - position.in_memory == self.on_disk
         assert position.seq <= self.seq

@@ -23,7 +23,7 @@ def handlers():
 
 
 @given(REASONS)
-def test_the_first_reason_counts_and_a_failure_is_never_hidden(reasons):
+def test_first_reason_counts_and_a_failure_is_never_hidden(reasons):
     ending = Ending()
     for reason, failed in reasons:
         ending.begin(reason, failed=failed)
@@ -34,7 +34,7 @@ def test_the_first_reason_counts_and_a_failure_is_never_hidden(reasons):
         assert ending.reason == reasons[0][0]
 
 
-def test_a_signal_is_a_reason_and_its_moment_is_that_of_the_first_one():
+def test_signal_is_a_reason_and_its_time_is_of_the_first_one():
     ending = Ending()
     assert ending.seconds_since_signal < 0
     os.kill(os.getpid(), signal.SIGTERM)
@@ -44,7 +44,7 @@ def test_a_signal_is_a_reason_and_its_moment_is_that_of_the_first_one():
     assert ending.seconds_since_signal >= first >= 0
 
 
-def test_a_process_has_ended_once_the_end_was_received_with_its_reason():
+def test_received_end_ends_a_process_with_its_reason():
     ending = Ending()
     ending.receive(End(2, "cannot decode frame 2", failed=True))
     assert (ending.reason, ending.failed, ending.ended) == ("cannot decode frame 2", True, True)

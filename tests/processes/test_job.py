@@ -1,4 +1,4 @@
-"""The files of a run: what it is, for its processes and for whoever resumes it, and who may have its state."""
+"""The job of a run as a file, and the lock of its state folder."""
 
 import os
 import stat
@@ -44,12 +44,12 @@ jobs = st.builds(
 
 
 @given(jobs)
-def test_a_job_is_read_as_it_was_written(tmp_path_factory, job):
+def test_job_is_read_as_it_was_written(tmp_path_factory, job):
     folder = tmp_path_factory.getbasetemp()
     assert Job.load(job.save(folder)) == Job.load(folder) == job
 
 
-def test_the_file_of_a_job_is_private_from_its_first_byte(tmp_path, monkeypatch):
+def test_file_of_a_job_is_private_from_its_first_byte(tmp_path, monkeypatch):
     before = os.umask(0)
     try:
         left = tmp_path / f".job.safetensors.{0:016x}.part"
@@ -64,11 +64,11 @@ def test_the_file_of_a_job_is_private_from_its_first_byte(tmp_path, monkeypatch)
     assert {stat.S_IMODE(mode) for mode in (modes[0], file.stat().st_mode)} == {0o600}
 
 
-def test_a_job_that_is_shown_does_not_show_its_password():
+def test_repr_of_a_job_hides_its_password():
     assert "secret" not in repr(JOB)
 
 
-def test_a_job_that_is_not_there_or_damaged_is_an_error_that_names_the_file(tmp_path):
+def test_missing_or_damaged_job_is_an_error(tmp_path):
     with pytest.raises(ServiceError, match="'my runs' contains no run: start one with --state 'my runs'"):
         Job.load(Path("my runs"))
     file = JOB.save(tmp_path)
@@ -80,14 +80,14 @@ def test_a_job_that_is_not_there_or_damaged_is_an_error_that_names_the_file(tmp_
 @pytest.mark.parametrize(
     ("field", "value"), [("size", [320]), ("resume", "yes"), ("models", ["ben"]), ("boxes", {"": [1, 2]}), ("part", 3)]
 )
-def test_a_field_of_another_type_is_an_error(tmp_path, field, value):
+def test_field_of_another_type_is_an_error(tmp_path, field, value):
     file = JOB.save(tmp_path)
     storage.write(file, {}, storage.read_metadata(file) | {field: value})
     with pytest.raises(ProtocolError, match="is not a valid job of a pipeline"):
         Job.load(file)
 
 
-def test_a_copy_of_a_process_that_lives_longer_does_not_keep_its_lock(tmp_path):
+def test_forked_copy_of_a_process_does_not_keep_its_lock(tmp_path):
     lives, ends = os.pipe()
     with locked(tmp_path / "kept"):
         if not os.fork():
@@ -100,7 +100,7 @@ def test_a_copy_of_a_process_that_lives_longer_does_not_keep_its_lock(tmp_path):
     os.close(lives)
 
 
-def test_a_folder_is_locked_by_one_process_and_free_once_that_is_killed(tmp_path):
+def test_folder_is_locked_until_its_process_ends(tmp_path):
     script = (
         "import pathlib, time\nfrom catstream.processes.state import locked\n"
         f"with locked(pathlib.Path({str(tmp_path)!r})):\n    print(flush=True)\n    time.sleep(600)"
@@ -114,7 +114,7 @@ def test_a_folder_is_locked_by_one_process_and_free_once_that_is_killed(tmp_path
         pass
 
 
-def test_a_saved_model_that_is_stored_while_a_state_is_read_is_in_it_if_it_is_named(tmp_path, monkeypatch):
+def test_model_stored_while_a_state_is_read_is_in_it(tmp_path, monkeypatch):
     for name in ("trees/000001.safetensors", "desired_state.json"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_text("{}")
@@ -133,17 +133,15 @@ def test_a_saved_model_that_is_stored_while_a_state_is_read_is_in_it_if_it_is_na
     assert "searched_models/0a.safetensors" in content
 
 
-def test_a_resumed_run_writes_its_own_list_of_files_or_else_the_earlier_one():
+def test_resumed_run_writes_its_own_or_the_earlier_files():
     earlier = Results(Path("out"), video=True, write=(Path("a.csv"), Path("b.sqlite")))
     assert Results().after(earlier) == earlier
     assert Results(write=(Path("c.csv"),)).after(earlier).write == (Path("c.csv"),)
     assert Results(video=False, write=()).after(earlier) == Results(Path("out"), video=False, write=())
-    rotated = Results(rotate="1d", keep=30)
-    assert Results().after(rotated) == rotated
-    assert Results(keep=7).after(rotated) == Results(rotate="1d", keep=7)
+    assert Results(keep=7).after(Results(rotate="1d", keep=30)) == Results(rotate="1d", keep=7)
 
 
-def test_a_state_folder_without_its_job_is_not_said_to_be_resumable(tmp_path):
+def test_state_folder_without_its_job_cannot_be_resumed(tmp_path):
     (tmp_path / "trees").mkdir()
     with (
         pytest.raises(ServiceError, match=r"without its job\.safetensors, which cannot be continued: use another"),

@@ -28,7 +28,7 @@ def learned():
     return tracker.saved_model("anna")
 
 
-def test_a_stored_model_is_read_by_its_name_and_by_its_owner_only(learned, tmp_path):
+def test_stored_model_is_private_and_read_by_its_name(learned, tmp_path):
     files = ModelFiles(tmp_path / "models")
     name = files.add(learned).model
     files.store()
@@ -37,7 +37,7 @@ def test_a_stored_model_is_read_by_its_name_and_by_its_owner_only(learned, tmp_p
     assert ModelFiles(tmp_path / "models").get(name).to_bytes() == learned.to_bytes()
 
 
-def test_a_model_that_is_damaged_or_was_removed_is_missing(learned, tmp_path, caplog):
+def test_damaged_or_removed_model_is_missing(learned, tmp_path, caplog):
     files = ModelFiles(tmp_path)
     name = files.add(learned).model
     files.store()
@@ -50,7 +50,7 @@ def test_a_model_that_is_damaged_or_was_removed_is_missing(learned, tmp_path, ca
 
 
 @pytest.mark.parametrize("has_state", [True, False])
-def test_the_model_of_a_search_that_is_rejected_is_not_kept(learned, folder, tmp_path, monkeypatch, has_state):
+def test_model_of_a_rejected_search_is_not_stored(learned, folder, tmp_path, monkeypatch, has_state):
     monkeypatch.setattr(signal, "signal", lambda *_: None)  # those of this process stay
     settings = Settings(coreset={"size": 8}, run={"max_objects": 1})
     state = tmp_path if has_state else None

@@ -1,4 +1,4 @@
-"""Backpressure: a detector waits for its owner and for the compressor, and for nobody else."""
+"""Backpressure: a detector waits for its program and for the compressor only."""
 
 from contextlib import closing
 from dataclasses import replace
@@ -20,11 +20,11 @@ def process(folder, monkeypatch):
         yield made
 
 
-def test_a_detector_is_no_more_frames_ahead_of_its_owner_than_may_be_unstored(process):
+def test_detector_waits_for_its_program(process):
     waits = []
 
     def turn():
-        """The owner reads one frame."""
+        """The program reads one frame."""
         waits.append(process.owner.read)
         process.owner.read += 1
 
@@ -42,7 +42,7 @@ def test_signalled_detector_does_not_wait_and_sends_nothing_after_a_drop(process
     with Outputs(process, lambda: pytest.fail("it waits"), lambda *_: None) as outputs:
         for seq in range(1, 9):
             outputs.send(Tracks(seq - 1, {}), Features(seq - 1, 0.0, {}))
-        assert outputs.features.window.sent == 4, "nobody has stored one"
+        assert outputs.features.window.sent == 4, "none is stored"
         outputs.features.window._unacknowledged.clear()
         outputs.send(Tracks(8, {}), Features(8, 0.0, {}))
         assert outputs.features.window.sent == 4

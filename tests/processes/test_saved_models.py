@@ -9,7 +9,6 @@ from catstream.client.saved_model import SavedModel
 from catstream.coreset.compressor import Compressor
 from catstream.processes.compressor import SavedModels
 from catstream.wire.channels import SAVED_MODELS
-from catstream.wire.messages import ModelFile
 from catstream.wire.newest import Subscriber
 from tests.learning import features
 
@@ -24,12 +23,8 @@ def compressor(name, rng, frames=6):
     return found
 
 
-def nothing():
-    """Do nothing after a file."""
-
-
-def received(publisher, compressors, reader, after_each=nothing):
-    """The first message that a subscriber receives while the publisher takes its turns."""
+def received(publisher, compressors, reader, after_each=lambda: None):
+    """The first message that a subscriber receives."""
     for _ in range(200):
         publisher.turn(compressors, after_each)
         if (message := reader.receive(0.05)) is not None:
@@ -37,14 +32,12 @@ def received(publisher, compressors, reader, after_each=nothing):
     raise AssertionError("nothing was received")
 
 
-def test_a_subscriber_receives_the_whole_trees_of_its_object(endpoint, rng):
-    compressors, made = {name: compressor(name, rng) for name in ("anna", "ben")}, Mock()
-    with (
-        SavedModels(endpoint, SETTINGS) as publisher,
-        Subscriber(SAVED_MODELS, endpoint, ModelFile, about="ben") as reader,
-    ):
-        message = received(publisher, compressors, reader, made)
-    assert made.call_count == 2, "the process reports that it lives after each file"
+def test_subscriber_receives_the_trees_of_found_objects(endpoint, rng):
+    compressors, after_each = {"anna": Compressor(SETTINGS, "anna"), "ben": compressor("ben", rng)}, Mock()
+    with SavedModels(endpoint, SETTINGS) as publisher, Subscriber(SAVED_MODELS, endpoint) as reader:
+        message = received(publisher, compressors, reader, after_each)
+        assert reader.receive(0.1) is None, "anna was not found yet"
+    assert after_each.called, "the process reports to the watchdog after each file"
     assert (message.object, message.version) == ("ben", compressors["ben"].version)
     assert message.file == SavedModel.of(compressors["ben"], SETTINGS).to_bytes()
 
@@ -53,24 +46,17 @@ def test_no_file_is_made_without_a_subscriber(endpoint, rng, monkeypatch):
     monkeypatch.setattr(SavedModel, "of", lambda *_: pytest.fail("a file was made"))
     with SavedModels(endpoint, SETTINGS) as publisher:
         for _ in range(3):
-            publisher.turn({"": compressor("", rng)}, nothing)
+            publisher.turn({"": compressor("", rng)}, Mock())
 
 
-def test_an_object_that_was_not_found_yet_has_no_file(endpoint, rng):
-    compressors = {"anna": Compressor(SETTINGS, "anna"), "ben": compressor("ben", rng)}
-    with SavedModels(endpoint, SETTINGS) as publisher, Subscriber(SAVED_MODELS, endpoint) as reader:
-        assert received(publisher, compressors, reader).object == "ben"
-        assert reader.receive(0.1) is None
-
-
-def test_a_later_subscriber_receives_the_newest_trees(endpoint, rng):
+def test_later_subscriber_receives_the_newest_trees(endpoint, rng):
     compressors = {"": compressor("", rng)}
     with SavedModels(endpoint, SETTINGS) as publisher:
         with Subscriber(SAVED_MODELS, endpoint) as reader:
             first = received(publisher, compressors, reader)
         while publisher.has_subscribers:
-            publisher.turn(compressors, nothing)
+            publisher.turn(compressors, Mock())
         compressors[""] = compressor("", rng, frames=30)
-        publisher.turn(compressors, nothing)
+        publisher.turn(compressors, Mock())
         with Subscriber(SAVED_MODELS, endpoint) as reader:
             assert received(publisher, compressors, reader).version == compressors[""].version > first.version

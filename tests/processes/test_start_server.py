@@ -31,7 +31,7 @@ def own_server(monkeypatch):
 
 @pytest.fixture
 def start(folder, tmp_path, until):
-    """Starts a trainer, which takes turns until it is ended; its process, its memory and its log."""
+    """Starts a trainer, which runs until it is ended; its process, its memory and its log."""
     started = []
 
     def trainer(job=None):
@@ -52,7 +52,7 @@ def start(folder, tmp_path, until):
 
 
 def opened(pid):
-    """What the descriptors of a process lead to."""
+    """The targets of the descriptors of a process."""
     places = {}
     for name in Path(f"/proc/{pid}/fd").iterdir():
         with suppress(FileNotFoundError):  # it opens and closes files meanwhile
@@ -60,7 +60,7 @@ def opened(pid):
     return places
 
 
-def test_process_is_forked_in_the_folder_of_its_program_without_files_of_the_server(start, tmp_path, monkeypatch):
+def test_process_inherits_the_folder_and_no_file_of_the_server(start, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     started, _, log = start()
     process, server = psutil.Process(started.pid), start_server()
@@ -76,7 +76,7 @@ def test_process_is_forked_in_the_folder_of_its_program_without_files_of_the_ser
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 4), (signal.SIGKILL, -signal.SIGKILL)])
-def test_how_a_process_has_ended_is_known(start, until, number, code):
+def test_exit_code_or_signal_of_a_process_is_known(start, until, number, code):
     process, *_ = start()
     assert process.poll() is None
     process.send_signal(number)
@@ -85,7 +85,7 @@ def test_how_a_process_has_ended_is_known(start, until, number, code):
 
 
 @pytest.mark.usefixtures("own_server")
-def test_the_processes_end_with_their_start_server_and_a_new_one_starts_the_next(start, alive, until):
+def test_processes_end_with_their_start_server(start, alive, until):
     process, *_ = start()
     running, server = process.pid, start_server()
     os.kill(server.pid, signal.SIGKILL)
@@ -96,7 +96,7 @@ def test_the_processes_end_with_their_start_server_and_a_new_one_starts_the_next
     assert psutil.Process(again.pid).ppid() == start_server().pid != server.pid
 
 
-def test_a_program_without_standard_streams_has_processes_that_run(tmp_path, folder):
+def test_processes_run_if_their_program_has_no_standard_streams(tmp_path, folder):
     """As after `nohup ... <&- >&- 2>&- &`."""
     job, log = Job(endpoint=str(folder)).save(tmp_path), tmp_path / "log"
     program = f"""
@@ -118,7 +118,7 @@ os._exit(0 if code is None else 1)
 
 
 @pytest.mark.usefixtures("own_server")
-def test_a_process_begins_with_no_blocked_signal_and_as_many_files_as_it_may_have(start, until):
+def test_process_begins_with_no_blocked_signal_and_most_files(start, until):
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (min(soft, 512), hard))
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM, signal.SIGCHLD})
@@ -133,7 +133,7 @@ def test_a_process_begins_with_no_blocked_signal_and_as_many_files_as_it_may_hav
     assert until(process.poll) == 4
 
 
-def test_a_server_that_cannot_run_is_an_error_that_names_it(monkeypatch, until):
+def test_start_server_that_cannot_run_is_an_error(monkeypatch, until):
     monkeypatch.setattr(module, "_server", None)
     monkeypatch.setattr(sys, "executable", "/bin/false")
     server = start_server()
@@ -143,7 +143,7 @@ def test_a_server_that_cannot_run_is_an_error_that_names_it(monkeypatch, until):
     assert module._server is None
 
 
-def test_a_copy_of_a_program_that_was_forked_starts_a_server_of_its_own():
+def test_forked_copy_of_a_program_starts_its_own_server():
     server = start_server()
     reading, writing = os.pipe()
     if not (pid := os.fork()):
@@ -159,7 +159,7 @@ def test_a_copy_of_a_program_that_was_forked_starts_a_server_of_its_own():
 
 
 @pytest.mark.parametrize(("name", "value"), [("frozen", True), ("executable", ""), ("executable", "/gone/python")])
-def test_a_program_without_an_interpreter_gets_one_clear_error(monkeypatch, name, value):
+def test_program_without_an_interpreter_gets_one_clear_error(monkeypatch, name, value):
     monkeypatch.setattr(module, "_server", None)
     monkeypatch.setattr(sys, name, value, raising=False)
     with pytest.raises(ServiceError, match="run it with python"):
@@ -188,13 +188,12 @@ def test_log_yields_the_whole_lines_of_the_process_itself(tmp_path):
     ("code", "ending"),
     [
         (-signal.SIGKILL, "signal SIGKILL, not sent by catstream; out of memory?"),
-        (-signal.SIGABRT, "signal SIGABRT: its last line"),
         (-(signal.SIGRTMIN + 1), f"signal {signal.SIGRTMIN + 1}"),
         (1, "exit code 1: its last line"),
         (STOPPED_EARLY, "another program asked it to end with a signal"),
     ],
 )
-def test_reason_of_a_death_has_the_signal_and_the_last_line_of_the_process(tmp_path, code, ending):
+def test_reason_of_a_death_has_the_signal_and_the_last_line(tmp_path, code, ending):
     child = Child("trainer", tmp_path, tmp_path)
     with closing(child.log), (tmp_path / "trainer.log").open("ab") as file:
         file.write(b"trainer: its last line\n")
@@ -204,7 +203,7 @@ def test_reason_of_a_death_has_the_signal_and_the_last_line_of_the_process(tmp_p
         assert child.ending(code) == ending.removesuffix(": its last line")
 
 
-def test_reason_of_a_death_is_that_of_the_start_server_or_the_watchdog(tmp_path):
+def test_reason_of_a_death_names_the_start_server_or_watchdog(tmp_path):
     child = Child("trainer", tmp_path, tmp_path)
     with closing(child.log):
         child.process = Mock(lost=True, server_code=-signal.SIGTERM)
@@ -220,9 +219,7 @@ def test_reason_of_a_death_is_that_of_the_start_server_or_the_watchdog(tmp_path)
         ("a.mp4", "trainer:a.mp4", "catstream trainer a.mp4", 0),
     ],
 )
-def test_process_shows_its_stream_without_its_password_and_is_nicer_if_it_is_live(
-    start, folder, until, source, name, line, nicer
-):
+def test_process_title_has_the_stream_without_its_password(start, folder, until, source, name, line, nicer):
     process, _, _ = start(Job(source, endpoint=str(folder)).save(folder))
     trainer = psutil.Process(process.pid)
     until(lambda: trainer.cmdline()[0] == line[: len(trainer.cmdline()[0])])
