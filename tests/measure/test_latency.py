@@ -22,7 +22,7 @@ def test_latency_of_a_tracked_frame_ends_with_its_own_track(schedule, track):
     assert measures.skipped == 0
 
 
-def test_latency_of_a_skipped_frame_ends_with_the_track_of_a_newer_one(schedule, track):
+def test_latency_of_a_skipped_frame_ends_with_a_newer_track(schedule, track):
     observations = Observations(tracks=[track(0, 0.02), track(5, 0.02), track(9, 0.02)])
     measures = measure(observations, schedule, 10, TRUTH, end=102.0, totals={})
     assert measures.track[1:6] == pytest.approx([0.42, 0.32, 0.22, 0.12, 0.02])
@@ -31,7 +31,7 @@ def test_latency_of_a_skipped_frame_ends_with_the_track_of_a_newer_one(schedule,
     assert measures.track.max() == pytest.approx(4.2)  # until the end of the run
 
 
-def test_success_compares_the_last_box_with_the_truth_of_each_frame_with_an_object(schedule, track):
+def test_success_compares_the_last_box_with_each_frame(schedule, track):
     tracks = [track(number, 0.02) for number in (2, 3, 4, 5)]  # frames 5 to 9 show the images again
     wrong = [(moment, replace(track, box=BOX._replace(x=25.0))) for moment, track in [track(6, 0.02)]]
     measures = measure(Observations(tracks=tracks + wrong), schedule, 10, TRUTH, end=102.0, totals={})
@@ -44,14 +44,14 @@ def test_success_repeats_the_last_repetition_of_the_video(schedule, track):
     assert measure(observations, schedule, 10, boxes, end=102.0, totals={}, images=2).success == 9 / 10
 
 
-def test_still_frames_before_and_after_a_run_count_only_for_the_time_within_it(schedule, track):
+def test_still_frames_outside_a_run_do_not_count(schedule, track):
     observations = Observations(tracks=[track(-3, 0.01), track(4, 0.01), track(12, 0.01)])
     measures = measure(observations, schedule, 10, TRUTH, end=105.0, totals={})
     assert measures.tracked.sum() == 1
     assert measures.track.max() == pytest.approx(0.71)
 
 
-def test_model_latency_ends_with_the_first_model_of_the_frame_or_a_newer_one(schedule, track):
+def test_model_latency_ends_with_the_first_newer_model(schedule, track):
     observations = Observations(tracks=[track(number, 0.02) for number in range(10)])
     observations.models = [(100.45, schedule.due(2)), (100.95, schedule.due(7)), (101.5, schedule.due(9))]
     measures = measure(observations, schedule, 10, TRUTH, end=102.0, totals={})
@@ -76,7 +76,7 @@ def test_latencies_equal_those_of_brute_force(answers, frames):
     np.testing.assert_allclose(found, np.array(expected) - due)
 
 
-def test_percentiles_are_latencies_of_frames_and_the_last_is_the_longest(rng):
+def test_percentile_is_the_latency_of_a_frame(rng):
     seconds = rng.lognormal(-4, 1, 2_001)
     found = percentiles(seconds)
     for name, percentile in PERCENTILES.items():

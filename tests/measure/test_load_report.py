@@ -1,6 +1,7 @@
 """The report: the figures and the limits that were not met, on one page that needs nothing else."""
 
 import json
+import re
 
 import numpy as np
 
@@ -27,10 +28,10 @@ def test_a_search_shows_the_number_of_streams_and_the_steps(result, tmp_path):
 
 
 def test_verdict_is_the_first_line_of_the_report_and_in_json(result, tmp_path):
-    for tracked, told in ((1.0, "Sustained: 2 streams"), (0.8, "Not sustained (skipped): 2 streams")):
+    for tracked, words in ((1.0, "Sustained: 2 streams"), (0.8, "Not sustained (skipped): 2 streams")):
         run = result([0.01] * 50, [0.01] * 50, tracked=tracked)
         load_test = LoadTest(Limit.defaults(run.plan), results=[run])
-        assert verdict(load_test).startswith(told)
+        assert verdict(load_test).startswith(words)
         assert to_json(load_test, {})["sustained"] == (tracked == 1)
         page = write_report(tmp_path / "report.html", load_test, PROVENANCE).read_text()
         assert page.index(verdict(load_test)) < page.index("<h2>Streams</h2>")
@@ -44,33 +45,21 @@ def test_interrupted_search_says_at_least(result):
     assert verdict(load_test).startswith("Interrupted after 10.0 s: no verdict")
 
 
-def test_every_stream_and_process_has_its_row(result, tmp_path):
+def test_report_has_its_command_and_a_row_for_each_process(result, tmp_path):
     cores, memory = {"detector 0": 0.5, "detector 1": 0.7, REST: 0.1}, {"detector 0": 10**8, "detector 1": 2 * 10**8}
-    run = result(
-        [0.01] * 50, [0.02] * 50, readings=[Reading(105.0, 1.0, cores, memory)], errors=["stream 1: <it> died"]
-    )
+    readings = [Reading(105.0, 1.0, cores, memory)]
+    run = result([0.01] * 50, [0.02] * 50, readings=readings, errors=["stream 1: <it> died"])
     assert [run.cost(number)[1] for number in (0, 1)] == [10**8, 2 * 10**8]
     page = write_report(tmp_path / "report.html", LoadTest([], results=[run]), PROVENANCE).read_text()
-    for row in ("detector 0", "detector 1"):
-        assert f'<td class="text">{row}</td>' in page
+    assert all(f'<td class="text">{row}</td>' in page for row in ("detector 0", "detector 1", "all"))
     assert "stream 1: &lt;it&gt; died" in page
-    assert '<tr class="mean"><td class="text">all</td>' in page
-
-
-def test_report_states_when_how_and_where_it_was_measured(result, tmp_path):
-    page = write_report(tmp_path / "report.html", LoadTest([], results=[result([0.01] * 5)]), PROVENANCE).read_text()
     assert "<pre>catstream loadtest --limit p99=0.1 rtsp://camera/1</pre>" in page
-    assert f"{PROVENANCE['date']}, catstream {PROVENANCE['version']}, {PROVENANCE['machine']['processor']}," in page
 
 
 def test_chart_has_a_point_for_each_second(result, tmp_path):
-    cores, memory = {"detector 0": 0.5, "camera": 0.1, REST: 0.2}, {"detector 0": 10**8}
-    receipts = Receipts(0, "tracks", np.full((2, 50), 0.2), [50, 50], [0, 0])
-    run = result([0.1] * 50, readings=[Reading(105.0, 5.0, cores, memory)], subscribers=[receipts])
-    page = write_report(tmp_path / "report.html", LoadTest([], results=[run]), PROVENANCE).read_text()
-    assert page.count("<polyline") == 4 + 2 + 3 + 1  # latencies here and of the subscribers, frames, cores, memory
-    assert page.count('"100.0,50.0 300.0,50.0 500.0,50.0 700.0,50.0 900.0,50.0"') == 2  # 100 ms of 200
-    assert ">5 s</text>" in page
+    page = write_report(tmp_path / "report.html", LoadTest([], results=[result([0.1] * 50)]), PROVENANCE).read_text()
+    curves = re.findall(r'points="([^"]*)"', page)
+    assert {len(points.split()) for points in curves} == {5}
 
 
 def test_raw_file_has_a_row_for_each_frame_and_receiver(result, tmp_path):

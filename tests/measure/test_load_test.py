@@ -27,7 +27,7 @@ def children():
     return [child for child in psutil.Process().children(recursive=True) if child not in stay]
 
 
-def test_interrupted_run_returns_its_measurements_and_leaves_no_process():
+def test_interrupted_run_returns_its_measurements():
     def tell(_, share, figures):
         if share > 0.05 and "tracks" in figures:
             raise KeyboardInterrupt
@@ -44,7 +44,7 @@ def test_interrupted_run_returns_its_measurements_and_leaves_no_process():
     assert children() == []
 
 
-def test_still_before_the_first_frame_is_not_taken_for_it_at_a_low_rate():
+def test_still_before_a_run_is_not_its_first_frame():
     settings = Settings(run={"endpoint": "run"})  # is ignored: each stream of a load test has its own endpoint
     load_test = run_load_test(Plan(rate=1.0, duration=1.0, size=(64, 64), settings=settings), [])
     (stream,) = load_test.result.streams
@@ -79,10 +79,7 @@ def test_stream_starts_once_the_one_before_has_its_models(monkeypatch):
 
 @pytest.fixture
 def machine(monkeypatch, result):
-    """Makes a machine that serves so many streams or another number, and starts at most `most`; returns those tried.
-
-    The first run of `flaky` meets the limits, its second one does not.
-    """
+    """Simulates a machine that serves `capacity` streams, and starts `most`; the second run of `flaky` fails."""
 
     def made(capacity, most=1000, flaky=None, find="streams"):
         tried = []
@@ -106,28 +103,26 @@ def machine(monkeypatch, result):
 
 
 @pytest.mark.parametrize(
-    ("facts", "start", "steps", "highest"),
+    ("find", "facts", "plan", "steps", "highest"),
     [
-        ({"capacity": 6}, 1, [1, 2, 4, 8, 6, 7, 6], 6),
-        ({"capacity": 6, "most": 6}, 1, [1, 2, 4, 8, 6, 7, 6], 6),
-        ({"capacity": 3}, 8, [8, 4, 2, 3, 3], 3),
-        ({"capacity": 99}, 40, [40, 64, 64], 64),
-        ({"capacity": 0}, 2, [2, 1], None),
-        ({"capacity": 6, "flaky": 6}, 1, [1, 2, 4, 8, 6, 7, 6, 5, 5], 5),
-        ({"capacity": 1, "flaky": 1}, 1, [1, 2, 1], None),
+        ("streams", {"capacity": 6}, {}, [1, 2, 4, 8, 6, 7, 6], 6),
+        ("streams", {"capacity": 99}, {"streams": 40}, [40, 64, 64], 64),
+        ("streams", {"capacity": 0}, {"streams": 2}, [2, 1], None),
+        ("streams", {"capacity": 6, "flaky": 6}, {}, [1, 2, 4, 8, 6, 7, 6, 5, 5], 5),
+        ("rate", {"capacity": 160}, {"rate": 29.97}, [30, 60, 120, 240, 180, 150, 165, 157, 161, 157], 157),
+        ("subscribers", {"capacity": 160}, {}, [50, 100, 200, 150, 175, 162, 156, 156], 156),
     ],
 )
-def test_number_of_streams_is_bisected_and_confirmed(machine, facts, start, steps, highest):
-    tried = machine(**facts)
-    load_test = run_load_test(Plan(streams=start), [Limit("skipped", 0.0)], find="streams")
+def test_search_bisects_and_confirms_the_highest_number(machine, find, facts, plan, steps, highest):
+    tried = machine(**facts, find=find)
+    load_test = run_load_test(Plan(**plan), [Limit("skipped", 0.0)], find=find)
     assert (tried, load_test.highest) == (steps, highest)
-    assert load_test.result.plan.streams == (highest or 1)
+    assert getattr(load_test.result.plan, find) == (highest or 1)
     assert load_test.sustained == bool(highest)
-    assert violations(load_test.limits, load_test.result) == [] or highest is None
     assert to_json(load_test, {})["highest"] == highest
 
 
-def test_streams_that_do_not_start_are_a_step_of_a_search_but_not_the_first_one(machine):
+def test_streams_that_do_not_start_are_a_step_but_not_the_first(machine):
     machine(capacity=6, most=4)
     assert run_load_test(Plan(), [], find="streams").refused == dict.fromkeys((8, 6, 5), "it took too long")
     machine(capacity=6, most=0)
@@ -135,30 +130,14 @@ def test_streams_that_do_not_start_are_a_step_of_a_search_but_not_the_first_one(
         run_load_test(Plan(), [], find="streams")
 
 
-@pytest.mark.parametrize(
-    ("find", "plan", "steps"),
-    [
-        ("rate", {"rate": 29.97}, [30, 60, 120, 240, 180, 150, 165, 157, 161, 157]),
-        ("subscribers", {}, [50, 100, 200, 150, 175, 162, 156, 156]),
-        ("subscribers", {"subscribers": 400, "slow_subscribers": 300}, [400, 200, 100, 150, 175, 162, 156, 156]),
-    ],
-)
-def test_rate_and_subscribers_are_searched_to_within_5_percent(machine, find, plan, steps):
-    tried = machine(capacity=160, find=find)
-    load_test = run_load_test(Plan(**plan), [Limit("skipped", 0.0)], find=find)
-    assert (tried, load_test.highest) == (steps, steps[-1])
-
-
 def test_limit_applies_to_the_worst_stream(result):
     run = result([0.01] * 100, [0.01] * 90 + [0.2] * 10)
     assert violations([Limit("p99", 0.1)], run) == ["p99 is 200 ms, limit at most 100 ms (from a frame to its track)"]
     assert violations([Limit("p99", 0.2), Limit("p50", 0.01), Limit("max", 0.2), Limit("success", 0.9)], run) == []
-    assert violations([Limit("success", 0.95)], run) == [
-        "success is 0.9, limit at least 0.95 (share of frames with an IoU above 0.5)"
-    ]
+    assert "success is 0.9, limit at least 0.95" in violations([Limit("success", 0.95)], run)[0]
 
 
-def test_default_limits_allow_skipped_frames_only_with_the_warm_up():
+def test_default_limits_allow_skipped_frames_in_the_warm_up():
     assert Limit.defaults(Plan()) == [Limit("p99", 0.1), Limit("skipped", 0.0)]
     assert Limit.defaults(Plan(warm_up=True)) == [Limit("p99", 0.1), Limit("skipped", 0.01)]
     assert Limit("subscriber-missed", 0.0) in Limit.defaults(Plan(), find="subscribers")

@@ -16,10 +16,6 @@ from catstream.video.writer import VideoWriter
 BOX = Box(10.0, 10.0, 20.0, 20.0)
 
 
-def quiet(*_):
-    """Reports no progress."""
-
-
 @pytest.fixture
 def recording(image, tmp_path):
     """Writes frames of noise at these times, with B-frames or without."""
@@ -61,7 +57,7 @@ def test_recording_is_encoded_only_with_b_frames(recording, unloaded, b_frames):
     path = recording(np.arange(12) / 20, b_frames)
     plan = with_recording(Plan(video=path, boxes={"": BOX}, source="h264"), None)
     assert (plan.size, plan.rate, plan.objects) == ((240, 200), 20.0, 1)
-    video = prepare(plan, 30, quiet)
+    video = prepare(plan, 30, print)
     with av.open(path) as container:
         sizes = [packet.size for packet in container.demux(video=0) if packet.size]
     own = [len(unit) - 4 for unit in video.units[1:]]  # the first one has the parameters in front of it
@@ -79,7 +75,7 @@ def test_rate_of_the_load_may_differ_from_the_recording(recording):
 @pytest.mark.usefixtures("unloaded")
 def test_variable_frame_rate_is_reported(recording, caplog):
     plan = with_recording(Plan(video=recording([0.0, 0.05, 0.1, 0.3, 0.35]), boxes={"": BOX}), None)
-    prepare(plan, 5, quiet)
+    prepare(plan, 5, print)
     assert "variable frame rate" in caplog.text
 
 
@@ -87,23 +83,20 @@ def test_object_that_the_unloaded_run_never_finds_is_an_error(recording, monkeyp
     monkeypatch.setattr(load_video, "_unloaded_run", lambda _, units, __: [(np.nan,) * 4] * len(units))
     plan = with_recording(Plan(video=recording([0.0, 0.05]), boxes={"": BOX}), None)
     with pytest.raises(SettingsError, match="has not found the object"):
-        prepare(plan, 5, quiet)
+        prepare(plan, 5, print)
 
 
 @pytest.mark.parametrize(
-    ("facts", "kind", "said"),
+    ("facts", "kind", "message"),
     [
         ({}, ObjectError, "no object to track"),
         ({"boxes": {"": BOX._replace(x=900.0)}}, ValueError, "outside the frame"),
         ({"models": {"": Path("none.model")}}, SettingsError, "--model: there is no saved model"),
         ({"video": "rtsp://camera/1", "boxes": {"": BOX}}, VideoError, "is a live source"),
+        ({"times": [0.0], "boxes": {"": BOX}}, VideoError, "expected a video with two frames or more"),
     ],
 )
-def test_unusable_recording_is_an_error(recording, facts, kind, said):
-    with pytest.raises(kind, match=said):
-        with_recording(Plan(**{"video": recording([0.0, 0.05]), **facts}), None)
-
-
-def test_recording_of_one_frame_is_an_error(recording):
-    with pytest.raises(VideoError, match="expected a video with two frames or more"):
-        with_recording(Plan(video=recording([0.0]), boxes={"": BOX}), None)
+def test_unusable_recording_is_an_error(recording, facts, kind, message):
+    video = recording(facts.pop("times", [0.0, 0.05]))
+    with pytest.raises(kind, match=message):
+        with_recording(Plan(**{"video": video, **facts}), None)
