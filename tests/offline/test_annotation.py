@@ -16,20 +16,23 @@ FRAMES = 24
 
 
 @pytest.fixture(scope="module")
-def demo(demo_video):
-    return demo_video(FRAMES)
+def video(demo_video):
+    return demo_video(FRAMES)[0]
 
 
 @pytest.fixture(scope="module")
-def both_ends(demo):
+def truth(demo_video):
+    return demo_video(FRAMES)[1]
+
+
+@pytest.fixture(scope="module")
+def both_ends(video, truth):
     """The annotation of the video with its object's boxes in the first and the last frame."""
-    video, truth = demo
     with annotate(video, {"anna": {0: truth[0], FRAMES - 1: truth[-1]}}, jobs=1) as annotation:
         yield annotation
 
 
-def test_an_object_that_is_easy_to_track_is_checked_from_two_boxes(demo, both_ends):
-    _, truth = demo
+def test_two_boxes_check_all_frames_of_an_easy_object(truth, both_ends):
     tracks = both_ends.tracks["anna"]
     assert all(track.box.overlap(box) > 0.5 for track, box in zip(tracks, truth, strict=True))
     assert [(track.frame, track.object) for track in tracks] == [(frame, "anna") for frame in range(FRAMES)]
@@ -40,8 +43,7 @@ def test_an_object_that_is_easy_to_track_is_checked_from_two_boxes(demo, both_en
     assert both_ends.next_frame() is None
 
 
-def test_single_box_leaves_the_other_frames_unchecked(demo):
-    video, truth = demo
+def test_single_box_leaves_the_other_frames_unchecked(video, truth):
     with annotate(video, {3: truth[3]}, jobs=1) as annotation:
         assert all(track.box is not None for track in annotation.tracks[""])
         assert annotation.checked[""].count("unchecked") == FRAMES - 1
@@ -49,18 +51,7 @@ def test_single_box_leaves_the_other_frames_unchecked(demo):
         assert {question.frame for question in annotation.next_frames()} == {0, FRAMES - 1}
 
 
-def test_a_box_that_is_added_is_tracked_from_and_earlier_passes_remain(demo):
-    video, truth = demo
-    with annotate(video, {0: truth[0], 12: truth[12], FRAMES - 1: truth[-1]}, jobs=1) as annotation:
-        before = annotation.passes()
-        annotation.add(18, truth[18])
-        added = [one for one in annotation.passes() if one not in before]
-        assert len(annotation.passes()) == len(before) + len(added)
-        assert {(one.start, one.stop) for one in added} == {(18, 12), (18, FRAMES - 1)}
-
-
-def test_a_box_that_is_replaced_drops_what_was_tracked_from_it(demo):
-    video, truth = demo
+def test_replaced_box_drops_the_passes_from_it(video, truth):
     wrong = truth[-1].centred(60, 60)
     with annotate(video, {0: truth[0], FRAMES - 1: wrong}, jobs=1) as annotation:
         before = annotation.passes()
@@ -69,8 +60,7 @@ def test_a_box_that_is_replaced_drops_what_was_tracked_from_it(demo):
         assert annotation.share_checked == 1
 
 
-def test_two_processes_give_the_same_tracks_as_one_and_remain_for_added_boxes(demo, both_ends):
-    video, truth = demo
+def test_two_processes_give_the_same_tracks_as_one(video, truth, both_ends):
     with annotate(video, {"anna": {0: truth[0], FRAMES - 1: truth[-1]}}, jobs=2) as annotation:
         assert [*annotation.tracks["anna"]] == [*both_ends.tracks["anna"]]
         processes = {*multiprocessing.active_children()}
@@ -79,16 +69,14 @@ def test_two_processes_give_the_same_tracks_as_one_and_remain_for_added_boxes(de
     assert not multiprocessing.active_children()
 
 
-def test_absent_object_has_no_box(demo):
-    video, truth = demo
+def test_absent_object_has_no_box(video, truth):
     with annotate(video, {0: truth[0], FRAMES - 1: None}, jobs=1) as annotation:
         assert annotation.tracks[""][-1].state == "absent"
         annotation.add(FRAMES - 1, truth[-1])
         assert annotation.tracks[""][-1].box == truth[-1]
 
 
-def test_a_hidden_object_keeps_its_estimated_box_and_is_not_asked_for_there(demo):
-    video, truth = demo
+def test_hidden_object_keeps_its_estimated_box(video, truth):
     with annotate(video, {0: truth[0]}, jobs=1) as annotation:
         passes, tracks = annotation.passes(), annotation.tracks[""]
         asked = []
@@ -101,8 +89,7 @@ def test_a_hidden_object_keeps_its_estimated_box_and_is_not_asked_for_there(demo
         assert [annotation.checked[""][frame] for frame in (0, *asked)] == ["keyframe", *["hidden"] * 3]
 
 
-def test_finished_passes_remain_after_ctrl_c(demo, monkeypatch):
-    video, truth = demo
+def test_finished_passes_remain_after_ctrl_c(video, truth, monkeypatch):
     work, started = module._work, []
 
     def interrupted(*task):
@@ -121,13 +108,13 @@ def test_finished_passes_remain_after_ctrl_c(demo, monkeypatch):
         assert len(annotation.passes()) == 2
 
 
-def test_no_file_remains_and_none_holds_the_frames(demo, tmp_path, monkeypatch):
+def test_no_file_remains_and_none_holds_the_frames(video, truth, tmp_path, monkeypatch):
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-    with annotate(demo[0], {0: demo[1][0], FRAMES - 1: demo[1][-1]}, jobs=1) as annotation:
+    with annotate(video, {0: truth[0], FRAMES - 1: truth[-1]}, jobs=1) as annotation:
         sizes = [file.stat().st_size for file in tmp_path.rglob("*") if file.is_file()]
         assert sum(sizes) < annotation.frames[0].nbytes
     with pytest.raises(BoxError):
-        annotate(demo[0], {99: demo[1][0]})
+        annotate(video, {99: truth[0]})
     assert not [*tmp_path.iterdir()]
 
 
@@ -151,18 +138,17 @@ def test_the_frames_before_damage_that_a_pass_meets_are_tracked(walk, tmp_path):
         ({"a b": {0: (1, 2, 30, 40)}}, ObjectError, "not a name"),
     ],
 )
-def test_boxes_that_cannot_be_tracked_are_an_error(demo, boxes, error, message):
+def test_invalid_boxes_are_an_error(video, boxes, error, message):
     with pytest.raises(error, match=message):
-        annotate(demo[0], boxes)
+        annotate(video, boxes)
 
 
-def test_a_live_source_is_an_error():
+def test_live_source_is_an_error():
     with pytest.raises(VideoError, match="a live source"):
         annotate("rtsp://10.0.0.7/stream", {0: Box(1, 2, 30, 40)})
 
 
-def test_stored_passes_are_used_for_the_same_video_and_settings(demo, both_ends, tmp_path):
-    video, truth = demo
+def test_stored_passes_serve_the_same_video_and_settings(video, truth, both_ends, tmp_path):
     both_ends.stored = tmp_path / "passes"
     both_ends.save_passes()
     boxes = {"ben": {0: truth[0], FRAMES - 1: truth[-1]}}
@@ -185,9 +171,9 @@ def test_stored_passes_are_used_for_the_same_video_and_settings(demo, both_ends,
     assert missing()[0] == 2
 
 
-def test_a_pass_waits_while_it_is_paused(demo, monkeypatch):
+def test_paused_pass_waits(video, monkeypatch):
     waits = []
-    with Annotation(demo[0], {}) as annotation:
+    with Annotation(video, {}) as annotation:
         folder = Path(annotation._folder.name)
         with annotation.paused():
             monkeypatch.setattr(passes.time, "sleep", lambda _: waits.append((folder / passes.PAUSED).unlink()))

@@ -34,7 +34,7 @@ def lines(folder):
     return [json.loads(line) for line in (folder / "results.ndjson").read_text().splitlines()]
 
 
-def test_the_files_agree_and_the_report_is_self_contained(run, video, tmp_path):
+def test_files_agree_and_the_report_is_self_contained(run, video, tmp_path):
     code, output = run(video)
     assert code == 0, output
     folder = tmp_path / "found"
@@ -46,7 +46,7 @@ def test_the_files_agree_and_the_report_is_self_contained(run, video, tmp_path):
     assert not re.search(r'(?:src|href)="(?!data:)', page)
 
 
-def test_a_command_that_was_interrupted_keeps_its_results_and_continues(run, video, tmp_path, monkeypatch):
+def test_interrupted_command_keeps_its_results_and_continues(run, video, tmp_path, monkeypatch):
     add, steps = FileResult.add, []
 
     def interrupted(*arguments):
@@ -75,7 +75,7 @@ def test_a_command_that_was_interrupted_keeps_its_results_and_continues(run, vid
     assert rows(tmp_path / "found") == continued
 
 
-def test_results_of_another_search_or_no_results_are_refused_and_stay(run, video, tmp_path):
+def test_results_of_another_search_are_not_replaced(run, video, tmp_path):
     assert run(video)[0] == 0
     file = tmp_path / "found" / "results.ndjson"
     before = file.read_bytes()
@@ -88,7 +88,7 @@ def test_results_of_another_search_or_no_results_are_refused_and_stay(run, video
     assert file.read_text() == "[]\n"
 
 
-def test_a_folder_with_new_images_is_searched_again(run, images, tmp_path):
+def test_folder_with_new_images_is_searched_again(run, images, tmp_path):
     (folder := tmp_path / "photos").mkdir()
     for count in (1, 2):
         cv2.imwrite(str(folder / f"{count}.png"), images[count])
@@ -96,7 +96,7 @@ def test_a_folder_with_new_images_is_searched_again(run, images, tmp_path):
         assert {row["image"] for row in rows(tmp_path / "found")} == {f"{number}.png" for number in range(1, count + 1)}
 
 
-def test_damage_is_reported_and_everything_else_is_searched(run, video, rng, tmp_path):
+def test_damage_is_reported_and_other_files_are_searched(run, video, rng, tmp_path):
     data = bytearray(video.read_bytes())
     (tmp_path / "a.mp4").write_bytes(b"no video")
     data[len(data) // 2 : len(data) // 2 + 20_000] = rng.bytes(20_000)
@@ -110,7 +110,7 @@ def test_damage_is_reported_and_everything_else_is_searched(run, video, rng, tmp
     assert "is not a video" in (tmp_path / "found" / "report.html").read_text()
 
 
-def test_a_name_that_is_not_utf_8_stays_in_the_tables_and_the_report(run, video, tmp_path):
+def test_name_that_is_not_utf_8_is_in_table_and_report(run, video, tmp_path):
     path = tmp_path / os.fsdecode(b"caf\xe9.mp4")
     shutil.copy(video, path)
     code, output = run(path)

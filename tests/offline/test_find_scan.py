@@ -50,7 +50,7 @@ def test_find_yields_the_detections_of_all_paths_in_order(model_files, images, a
     assert {detection.object for detection in found} == {"dahlia"}
 
 
-def test_an_unreadable_file_is_an_error_after_the_detections_of_the_others(model_files, appearing, tmp_path):
+def test_unreadable_file_is_an_error_after_all_detections(model_files, appearing, tmp_path):
     (tmp_path / "damaged.mp4").write_bytes(appearing.read_bytes()[:2000])
     files = []
     with pytest.raises(VideoError, match="damaged"):
@@ -65,38 +65,36 @@ def test_no_model_and_two_models_with_one_name_are_errors(model_files):
         load_models([])
 
 
-def every_window(cells, weights, bias, least):
-    """As `Cells.respond_above`, with the score of every window computed to the end."""
-    scores = cells.respond(weights, bias)
-    return np.where(scores >= least, scores, -np.inf)
+@pytest.mark.parametrize("number", [0, 40])
+def test_several_models_find_the_windows_of_each_alone(learned, images, number, monkeypatch):
+    def respond_above(cells, weights, bias, least):
+        scores = cells.respond(weights, bias)
+        return np.where(scores >= least, scores, -np.inf)
 
-
-@pytest.mark.parametrize("number", [0, 20, 40, 59])
-def test_models_together_find_the_windows_of_each_models_plain_scan(learned, images, number, monkeypatch):
     frame = Pyramid(images[number])
     together = Scan(learned, 0.2).windows(frame)
-    monkeypatch.setattr(Cells, "respond_above", every_window)
+    monkeypatch.setattr(Cells, "respond_above", respond_above)
     plain = [Scan([each], 0.2).windows(frame)[0] for each in learned]
     for ours, theirs in zip(together, plain, strict=True):
         assert [each.score for each in ours] == pytest.approx([each.score for each in theirs], abs=1e-4)
         np.testing.assert_allclose([each.window for each in ours], [each.window for each in theirs])
 
 
-def test_the_object_is_found_at_its_box(learned, images, demo_video):
+def test_object_is_found_at_its_box(learned, images, demo_video):
     for number in (20, 40, 59):
         dahlia, _ = Scan(learned)(images[number])
         assert dahlia[0].box.overlap(demo_video(60)[1][number]) > 0.6
         assert dahlia[0].score > 0.7
 
 
-def test_every_detection_reaches_the_threshold_and_overlaps_no_better_one(learned, images):
+def test_detections_reach_the_threshold_and_do_not_overlap(learned, images):
     for found in Scan(learned, 0.1)(images[30]):
         assert [each.score for each in found] == sorted((each.score for each in found), reverse=True)
         assert all(each.score >= 0.1 for each in found)
         assert all(a.window.overlap(b.window) < 0.3 for k, a in enumerate(found) for b in found[:k])
 
 
-def test_a_frame_without_the_object_or_smaller_than_a_window_has_no_detection(learned, rng):
+def test_frame_without_the_object_has_no_detection(learned, rng):
     noise = rng.integers(0, 256, (240, 320, 3), np.uint8)
     for image in (noise, np.full((240, 320, 3), 128, np.uint8), np.zeros((9, 12, 3), np.uint8)):
         assert Scan(learned)(image) == [[], []]
@@ -152,7 +150,7 @@ def names(tree, *paths):
 EVERYTHING = ["clips/a.mp4", "clips/deep/b.MP4", "photos"]
 
 
-def test_folders_are_searched_with_their_subfolders_and_each_file_once(tree):
+def test_folder_is_searched_deeply_and_each_file_once(tree):
     (tree / "loop").symlink_to(tree)
     (tree / "z.mp4").symlink_to(tree / "clips" / "a.mp4")
     (tree / "z-folder").symlink_to(tree / "photos")
@@ -162,7 +160,7 @@ def test_folders_are_searched_with_their_subfolders_and_each_file_once(tree):
     assert [name for _, name, _ in frames(find_files([tree / "photos"])[0])[0]] == ["1.png", "9.png", "10.png"]
 
 
-def test_hidden_folders_are_skipped_and_other_kinds_are_counted(tree, caplog):
+def test_hidden_folders_are_skipped_and_other_kinds_counted(tree, caplog):
     for name in ("d.heic", "e.heic", "f"):
         shutil.copy(tree / "clips" / "a.mp4", tree / "clips" / name)
     assert names(tree) == EVERYTHING
@@ -170,7 +168,7 @@ def test_hidden_folders_are_skipped_and_other_kinds_are_counted(tree, caplog):
     assert names(tree, tree / ".hidden") == [".hidden/c.mp4"]
 
 
-def test_images_are_read_each_in_its_size_and_unreadable_ones_are_reported(tree):
+def test_images_have_their_sizes_and_errors_are_reported(tree):
     (tree / "photos" / "8.png").write_bytes(b"no picture")
     cv2.imwritemulti(str(tree / "a.tif"), [np.zeros((20, 30 + page), np.uint8) for page in range(3)])
     folder, several = find_files([tree / "photos", tree / "a.tif"])
@@ -180,7 +178,7 @@ def test_images_are_read_each_in_its_size_and_unreadable_ones_are_reported(tree)
     assert frames(several)[0] == [(page, "", (20, 30 + page, 3)) for page in range(3)]
 
 
-def test_a_video_is_searched_by_time_whatever_its_rate(tmp_path):
+def test_video_is_searched_by_time(tmp_path):
     times = [0.0, 0.01, 0.05, 0.19, 0.2, 0.31, 0.6, 0.61, 3.0, 3.01]
     with av.open(str(tmp_path / "a.ts"), "w") as container:
         stream = container.add_stream("mpeg4", rate=25)
@@ -204,7 +202,7 @@ def test_a_video_is_searched_by_time_whatever_its_rate(tmp_path):
         ("rtsp://a:b@c/d", "no file or folder 'rtsp://c/d'"),
     ],
 )
-def test_what_cannot_be_searched_is_an_error(tmp_path, name, message, monkeypatch):
+def test_path_without_images_or_videos_is_an_error(tmp_path, name, message, monkeypatch):
     (tmp_path / "empty").mkdir()
     (tmp_path / "texts").mkdir()
     (tmp_path / "texts" / "a.txt").touch()

@@ -1,4 +1,4 @@
-"""A long video is annotated with the disk, the memory and the work of the stretch that is looked at."""
+"""A long video: the costs of annotation are those of the annotated stretch."""
 
 import resource
 import tempfile
@@ -48,7 +48,7 @@ def growth(frames: VideoFrames) -> int:
     return 1024 * (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)
 
 
-def test_images_of_a_long_video_are_read_in_bounded_memory(video):
+def test_long_video_is_read_in_bounded_memory(video):
     frames = VideoFrames(video)
     frames.scan()
     assert len(frames) == FRAMES
@@ -57,7 +57,7 @@ def test_images_of_a_long_video_are_read_in_bounded_memory(video):
     assert grown < MOST_BYTES
 
 
-def test_a_stretch_of_a_long_video_is_annotated_without_the_rest(video, tmp_path, monkeypatch):
+def test_stretch_of_a_long_video_is_annotated_alone(video, tmp_path, monkeypatch):
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     ends = STRETCH[0], STRETCH[-1]
     with Annotation(video, {frame: box_at(frame) for frame in ends}, jobs=1) as annotation:

@@ -28,15 +28,15 @@ def saved():
 
 
 @pytest.fixture
-def session(demo, saved):
+def session(demo, saved, until):
     annotation = Annotation(demo[0], {}, jobs=2)
     with annotation, Session(annotation, 1, lambda: saved.append(annotation.keyframes), lambda: None) as one:
+        until(lambda: one.decoded)
         yield one
 
 
 def test_boxes_are_saved_and_tracked_until_all_frames_are_checked(session, saved, demo, until):
     truth = demo[1]
-    until(lambda: session.decoded)
     session.draw("anna", 0, truth[0])
     until(lambda: [each.frame for each in session.next_frames] == [FRAMES - 1])
     session.draw("anna", FRAMES - 1, truth[-1])
@@ -45,16 +45,15 @@ def test_boxes_are_saved_and_tracked_until_all_frames_are_checked(session, saved
     assert {track.checked for track in session.tracks["anna"]} == {"keyframe", "checked"}
 
 
-def test_a_session_has_remaining_frames_as_soon_as_a_box_is_drawn(session, demo, until):
+def test_frames_remain_as_soon_as_a_box_is_drawn(session, demo, until):
     until(lambda: not session.remaining())
     with session.lock:  # its thread cannot look for the missing passes
         session.draw("anna", 0, demo[1][0])
         assert session.remaining()
 
 
-def test_a_change_that_is_undone_brings_the_earlier_box_and_passes_back(session, saved, demo, until):
+def test_undo_restores_the_earlier_box_and_its_passes(session, saved, demo, until):
     truth = demo[1]
-    until(lambda: session.decoded)
     session.draw("anna", 0, truth[0])
     until(lambda: session.annotation.passes("anna"))
     before = session.annotation.passes("anna")
@@ -67,8 +66,7 @@ def test_a_change_that_is_undone_brings_the_earlier_box_and_passes_back(session,
     assert session.undo() is None
 
 
-def test_a_renamed_object_keeps_its_passes_and_gets_its_name_back(session, demo, until):
-    until(lambda: session.decoded)
+def test_renamed_object_keeps_its_passes(session, demo, until):
     session.draw("anna", 0, demo[1][0])
     until(lambda: session.annotation.passes("anna"))
     session.rename("anna", "ben")
@@ -82,9 +80,8 @@ def test_a_renamed_object_keeps_its_passes_and_gets_its_name_back(session, demo,
     assert session.annotation.keyframes == {"anna": {0: demo[1][0]}}
 
 
-def test_a_deleted_box_or_object_comes_back(session, saved, demo, until):
+def test_undo_restores_a_deleted_box_or_object(session, saved, demo):
     first, last = demo[1][0], demo[1][-1]
-    until(lambda: session.decoded)
     for name, frame, box in (("anna", 0, first), ("anna", 9, None), ("anna", FRAMES - 1, last), ("ben", 0, first)):
         session.draw(name, frame, box)
     drawn = [saved[-1]]
@@ -101,8 +98,7 @@ def test_a_deleted_box_or_object_comes_back(session, saved, demo, until):
     assert saved[-1] == drawn[0]
 
 
-def test_no_change_follows_the_results(session, saved, demo, until):
-    until(lambda: session.decoded)
+def test_finished_session_rejects_changes(session, saved, demo):
     session.draw("anna", 0, demo[1][0])
     session.finish()
     with pytest.raises(CommandRejectedError):
@@ -110,9 +106,8 @@ def test_no_change_follows_the_results(session, saved, demo, until):
     assert [*saved[-1]] == ["anna"]
 
 
-def test_a_new_box_stops_the_passes_that_are_not_missing_any_more(session, demo, until, monkeypatch):
+def test_new_box_stops_the_passes_of_the_replaced_one(session, demo, until, monkeypatch):
     monkeypatch.setattr(module, "_LONG", 0)
-    until(lambda: session.decoded)
     session.draw("anna", 0, demo[1][0].centred(60, 60))
     until(lambda: session.remaining() > 1 or session.annotation.passes("anna"))
     session.draw("anna", 0, demo[1][0])
@@ -144,14 +139,13 @@ def test_objects_take_turns(demo, until, monkeypatch):
         (("anna", 0, None), ObjectError),
     ],
 )
-def test_a_change_that_is_not_valid_is_not_saved(session, saved, until, change, error):
-    until(lambda: session.decoded)
+def test_invalid_change_is_not_saved(session, saved, change, error):
     with pytest.raises(error):
         session.draw(*change)
     assert (saved, session.annotation.keyframes, session.can_undo) == ([], {}, False)
 
 
-def test_a_change_that_cannot_be_saved_is_undone(demo, until):
+def test_change_that_cannot_be_saved_is_undone(demo, until):
     def full():
         raise ServiceError("the disk is full")
 
@@ -162,7 +156,7 @@ def test_a_change_that_cannot_be_saved_is_undone(demo, until):
         assert annotation.keyframes == {}
 
 
-def test_the_frames_before_one_that_cannot_be_decoded_are_annotated(walk, until, tmp_path):
+def test_frames_before_a_damaged_one_are_annotated(walk, until, tmp_path):
     images = shutil.copytree(walk / "img", tmp_path / "img")
     (images / "0006.png").write_bytes(b"no image")
     with Annotation(images, {}) as annotation, Session(annotation, 1, lambda: None, lambda: None) as session:
@@ -175,15 +169,14 @@ def test_the_frames_before_one_that_cannot_be_decoded_are_annotated(walk, until,
         until(lambda: len(session.tracks.get("anna", [])) == 5)
 
 
-def test_passes_are_paused_while_an_image_is_decoded(session, until, monkeypatch):
-    until(lambda: session.decoded)
+def test_passes_are_paused_while_an_image_is_decoded(session, monkeypatch):
     file = Path(session.annotation._folder.name, PAUSED)
     monkeypatch.setattr(VideoFrames, "__getitem__", lambda *_: file.exists())
     assert session.image(3) is True
     assert not file.exists()
 
 
-def test_one_pass_more_than_long_ones_runs_at_a_time(demo, until, monkeypatch, tmp_path):
+def test_long_passes_leave_one_process_to_short_ones(demo, until, monkeypatch, tmp_path):
     monkeypatch.setattr(module, "_LONG", 10)
     submitted = []
 
@@ -202,7 +195,7 @@ def test_one_pass_more_than_long_ones_runs_at_a_time(demo, until, monkeypatch, t
                 assert submitted == [("carl", 3), ("anna", FRAMES - 1), ("ben", FRAMES - 1)]
 
 
-def test_a_session_that_ends_while_it_reads_is_not_decoded(demo):
+def test_session_that_ends_while_it_reads_is_not_decoded(demo):
     with Annotation(demo[0], {}) as annotation:
         session = Session(annotation, 1, lambda: None, lambda: None)
         session._closed = True
