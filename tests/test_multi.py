@@ -60,7 +60,7 @@ def of(name, frames):
     return [replace(tracks[name], model_version=0) for tracks in frames if name in tracks]
 
 
-def test_every_object_is_followed(together):
+def test_every_object_is_tracked(together):
     for number, tracks in enumerate(together, start=1):
         assert list(tracks) == list(STEPS)
         for name, track in tracks.items():
@@ -68,7 +68,7 @@ def test_every_object_is_followed(together):
             assert track.box.overlap(box_of(name, number)) > 0.6
 
 
-def test_an_object_of_several_is_followed_as_alone_bit_for_bit(frames, together):
+def test_object_among_several_is_tracked_as_alone(frames, together):
     for name in STEPS:
         assert of(name, together) == of(name, followed(frames, [name]))
 
@@ -111,7 +111,7 @@ def test_objects_that_come_and_go_do_not_affect_one_another(frames, lives):
     ],
     ids=["outside", "an old one and an empty one", "a bad name", "too many"],
 )
-def test_invalid_box_of_several_is_named_and_changes_nothing(frames, begin, error, why):
+def test_invalid_box_is_named_and_changes_nothing(frames, begin, error, why):
     tracker, other = started(frames, settings={"run.max_objects": 4}), started(frames)
     with pytest.raises(error, match=why):
         tracker.update(frames[1], begin=begin)
@@ -122,7 +122,7 @@ def test_invalid_box_of_several_is_named_and_changes_nothing(frames, begin, erro
     assert [tracker.update(frame) for frame in frames[1:4]] == [other.update(frame) for frame in frames[1:4]]
 
 
-def test_forget_drops_one_object_and_an_unknown_one_is_an_error(frames):
+def test_forget_drops_one_object(frames):
     with pytest.raises(BoxError, match="call init"):
         MultiTracker().forget("anna")
     tracker = started(frames, STEPS)
@@ -145,7 +145,7 @@ def cleo(frames):
     return tracker.saved_model("cleo")
 
 
-def test_an_object_of_a_saved_model_is_detected_and_does_not_affect_the_others(frames, cleo, tmp_path):
+def test_object_of_a_saved_model_does_not_affect_the_others(frames, cleo, tmp_path):
     cleo.save(tmp_path / "cleo")
     tracker, other = (started(frames, settings={"coreset.size": 8}) for _ in range(2))
     for number, frame in enumerate(frames[1:], start=1):
@@ -158,7 +158,7 @@ def test_an_object_of_a_saved_model_is_detected_and_does_not_affect_the_others(f
     assert set(cleo.origins) < set(tracker.saved_model("cleo").origins)
 
 
-def test_a_search_that_cannot_begin_changes_nothing(frames, cleo):
+def test_invalid_search_changes_nothing(frames, cleo):
     tracker, other = (started(frames, settings={"run.max_objects": most, "coreset.size": 8}) for most in (2, 8))
     for search, error, why in [
         ({"ben": cleo, "cleo": cleo}, ObjectError, r"too many objects \(3, limit 2\)"),
@@ -174,7 +174,7 @@ def test_a_search_that_cannot_begin_changes_nothing(frames, cleo):
     assert [tracker.update(frame) for frame in frames[1:4]] == [other.update(frame) for frame in frames[1:4]]
 
 
-def test_objects_are_together_from_their_first_frame_until_they_are_apart(frames):
+def test_overlapping_objects_are_together_until_disjoint(frames):
     """They are so if they begin in one frame, and if one begins after the other."""
     for later in (0, 2):
         tracker = MultiTracker()

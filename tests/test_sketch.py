@@ -34,14 +34,14 @@ def test_scikit_learn_accepts_the_estimator():
 
 
 @pytest.mark.parametrize("size", [40, 128])
-def test_components_are_those_of_a_pca_if_rows_are_no_longer_than_a_node(rows, size):
+def test_rows_no_longer_than_a_node_give_the_exact_pca(rows, size):
     pca, exact = CoresetPCA(5, size).fit(rows), PCA(5).fit(rows)
     assert_allclose(pca.components_, exact.components_, atol=1e-4)
     for name in ("mean_", "explained_variance_", "explained_variance_ratio_", "singular_values_"):
         assert_allclose(getattr(pca, name), getattr(exact, name), rtol=ROUNDING)
 
 
-def test_the_reconstruction_error_exceeds_the_least_by_no_more_than_the_dropped_energy(rows):
+def test_excess_error_is_at_most_the_dropped_energy(rows):
     pca, exact = CoresetPCA(5, size=16).fit(rows), PCA(5).fit(rows)
     assert pca.tree_.dropped_energy > 0
     slack = ROUNDING * pca.tree_.energy
@@ -49,7 +49,7 @@ def test_the_reconstruction_error_exceeds_the_least_by_no_more_than_the_dropped_
 
 
 @pytest.mark.parametrize("cuts", [[1, 2, 3], [500]], ids=["rows", "halves"])
-def test_a_stream_in_parts_is_fitted_as_one(rows, cuts):
+def test_stream_in_parts_is_fitted_as_one(rows, cuts):
     parts = CoresetPCA(5, size=16)
     for part in np.split(rows, cuts):
         parts.partial_fit(part)
@@ -92,6 +92,6 @@ def test_components_are_orthonormal_and_fewer_than_rows_are(rows):
 
 
 @pytest.mark.parametrize("n_components", [0, 17, 41])
-def test_components_that_a_tree_cannot_have_are_rejected(rows, n_components):
+def test_number_of_components_beyond_a_node_is_an_error(rows, n_components):
     with pytest.raises(ValueError, match=rf"n_components={n_components} is not between 1 and .*=16: choose fewer"):
         CoresetPCA(n_components, size=16).fit(rows)

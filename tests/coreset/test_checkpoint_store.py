@@ -30,7 +30,7 @@ def grow(rng):
 
 
 @pytest.fixture
-def kept(grow, tmp_path):
+def checkpoints(grow, tmp_path):
     """A folder of three checkpoints, after 40, 50 and 60 messages; the store has removed the first."""
     forest, store = grow(Forest(SETTINGS), 30), CheckpointStore(tmp_path)
     for _ in range(3):
@@ -46,70 +46,68 @@ def newest(folder):
     return max(folder.glob("*.safetensors"))
 
 
-def test_the_newest_two_checkpoints_are_kept_and_the_newest_is_used(kept):
-    assert files(kept) == ["000000000002.safetensors", "000000000003.safetensors"]
-    assert CheckpointStore(kept).load(SETTINGS).seq == 60
+def test_two_newest_checkpoints_remain_and_the_newest_is_loaded(checkpoints):
+    assert files(checkpoints) == ["000000000002.safetensors", "000000000003.safetensors"]
+    assert CheckpointStore(checkpoints).load(SETTINGS).seq == CheckpointStore(checkpoints).position()[0] == 60
 
 
-def test_a_folder_without_any_begins_anew(tmp_path):
+def test_empty_folder_begins_a_new_forest(tmp_path):
     assert CheckpointStore(tmp_path).load(SETTINGS).seq == 0
     assert CheckpointStore(tmp_path).position() == (0, 0.0)
 
 
-def test_the_number_is_that_of_the_checkpoint_that_would_be_loaded(kept):
-    for seq in (60, 50):
-        assert CheckpointStore(kept).position()[0] == CheckpointStore(kept).load(SETTINGS).seq == seq
-        data = bytearray(newest(kept).read_bytes())
-        data[-1] ^= 1  # in an array, not in the header
-        newest(kept).write_bytes(data)
-
-
-@pytest.mark.parametrize("share", [0, 0.001, 0.5, 0.999])
-def test_an_incomplete_checkpoint_is_detected_and_the_previous_one_is_used(kept, share, caplog):
-    whole = newest(kept).read_bytes()
-    newest(kept).write_bytes(whole[: int(share * len(whole))])
-    store = CheckpointStore(kept)
-    assert store.load(SETTINGS).seq == 50
+@pytest.mark.parametrize(
+    "damaged",
+    [
+        pytest.param(lambda whole: whole[:0], id="empty"),
+        pytest.param(lambda whole: whole[:-10], id="incomplete"),
+        pytest.param(lambda whole: whole[:-1] + bytes([whole[-1] ^ 1]), id="a bit of an array"),
+    ],
+)
+def test_damaged_checkpoint_is_detected_and_the_one_before_used(checkpoints, damaged, caplog):
+    newest(checkpoints).write_bytes(damaged(newest(checkpoints).read_bytes()))
+    store = CheckpointStore(checkpoints)
+    assert CheckpointStore(checkpoints).position()[0] == store.load(SETTINGS).seq == 50
     assert "damaged checkpoints: 1; that of frame 49 was used" in store.trouble
     assert "cannot be used" in caplog.text
 
 
-def test_after_a_damaged_checkpoint_the_next_one_is_kept_beside_the_valid_one(kept, grow):
-    newest(kept).write_bytes(b"torn")
-    store = CheckpointStore(kept)
+def test_checkpoint_after_a_damaged_one_keeps_the_valid_one(checkpoints, grow):
+    newest(checkpoints).write_bytes(b"torn")
+    store = CheckpointStore(checkpoints)
     assert store.save(grow(store.load(SETTINGS), 5))
-    assert files(kept) == ["000000000002.safetensors", "000000000004.safetensors", "damaged"]
-    newest(kept).write_bytes(b"torn")
-    assert CheckpointStore(kept).load(SETTINGS).seq == 50
+    assert files(checkpoints) == ["000000000002.safetensors", "000000000004.safetensors", "damaged"]
+    newest(checkpoints).write_bytes(b"torn")
+    assert CheckpointStore(checkpoints).load(SETTINGS).seq == 50
 
 
-def test_if_no_checkpoint_is_valid_learning_starts_anew_and_that_is_reported(kept):
-    for path in kept.iterdir():
+def test_folder_without_a_valid_checkpoint_starts_again(checkpoints):
+    for path in checkpoints.iterdir():
         path.write_bytes(b"")
-    store = CheckpointStore(kept)
+    store = CheckpointStore(checkpoints)
     assert store.load(SETTINGS).seq == 0
     assert "damaged checkpoints: 2; training starts again" in store.trouble
 
 
-def test_a_full_disk_is_reported_and_existing_checkpoints_are_kept(kept, grow, monkeypatch):
+def test_full_disk_is_reported_and_keeps_the_checkpoints(checkpoints, grow, monkeypatch):
     def full(_):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    before, store = files(kept), CheckpointStore(kept)
+    before, store = files(checkpoints), CheckpointStore(checkpoints)
     forest = grow(store.load(SETTINGS), 5)
     with monkeypatch.context() as disk:
         disk.setattr(os, "fsync", full)
         assert not store.save(forest)
     assert "No space left on device" in store.trouble
-    assert files(kept) == before
-    assert CheckpointStore(kept).load(SETTINGS).seq == 60
+    assert files(checkpoints) == before
+    assert CheckpointStore(checkpoints).load(SETTINGS).seq == 60
     assert store.save(forest)
     assert not store.trouble
-    assert CheckpointStore(kept).load(SETTINGS).seq == 65
+    assert CheckpointStore(checkpoints).load(SETTINGS).seq == 65
 
 
 @pytest.mark.parametrize("disk", [1 << 20], indirect=True)
-def test_on_a_full_disk_older_checkpoints_make_room_for_the_next_one_but_not_the_only_one(disk, fill, grow, caplog):
+def test_full_disk_removes_older_checkpoints_for_the_next_one(disk, fill, grow, caplog):
     forest, store = grow(Forest(SETTINGS), 30), CheckpointStore(disk)
     for durable in (True, False, False):
         assert store.save(grow(forest, 10), durable=durable)
@@ -125,7 +123,7 @@ def test_on_a_full_disk_older_checkpoints_make_room_for_the_next_one_but_not_the
     assert len(caplog.messages) == 1
 
 
-def test_the_newest_durable_checkpoint_remains_for_a_power_cut(grow, tmp_path):
+def test_newest_durable_checkpoint_survives_a_power_cut(grow, tmp_path):
     forest, store = Forest(SETTINGS), CheckpointStore(tmp_path)
     for durable in (True, False, True, False, False, False):
         assert store.save(grow(forest, 10), durable=durable)

@@ -60,7 +60,7 @@ def test_memory_does_not_grow_with_the_rows(rng):
     assert len(sizes) == 1
 
 
-def test_a_count_that_is_not_that_of_its_level_is_rejected(stream):
+def test_state_with_a_wrong_count_is_an_error(stream):
     arrays, metadata = sketched(stream).state()
     metadata["nodes"][0]["count"] += 1
     with pytest.raises(ProtocolError, match="not the state of a coreset tree"):

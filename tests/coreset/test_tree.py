@@ -63,7 +63,7 @@ def test_distances_to_subspaces_stay_within_the_bound(stream, subspaces, squared
     assert_within_the_bound(grown(stream), stream, subspaces, squared_distance)
 
 
-def test_a_stream_that_stands_still_loses_nothing(rng):
+def test_equal_rows_lose_no_energy(rng):
     """Equal rows make a Gram matrix of equal eigenvalues, on which less careful solvers fail."""
     rows = np.tile(rng.uniform(size=30), (SIZE * 32, 1)).astype(np.float32)
     tree = grown(rows)
@@ -99,7 +99,7 @@ def test_memory_grows_with_the_logarithm_of_the_rows(rng):
 
 @KINDS
 @given(st.lists(st.integers(0, 20), max_size=12), seeds)
-def test_same_rows_same_bits_however_they_are_cut(kind, cuts, seed):
+def test_rows_in_parts_give_the_same_bits(kind, cuts, seed):
     rows = np.random.default_rng(seed).normal(size=(sum(cuts), 33)).astype(np.float32)
     tree = kind(4)
     for part in np.split(rows, np.cumsum(cuts)):
@@ -107,7 +107,7 @@ def test_same_rows_same_bits_however_they_are_cut(kind, cuts, seed):
     assert bits(tree) == bits(grown(rows, 4, kind))
 
 
-def test_a_tree_keeps_no_reference_to_inserted_rows(stream):
+def test_tree_holds_no_reference_to_inserted_rows(stream):
     rows = stream.copy()
     tree, other = grown(rows[:50]), grown(stream[:50])
     rows[:] = 0
@@ -135,7 +135,7 @@ def test_merging_keeps_the_form_of_a_tree(count, other_count, seed):
 
 @KINDS
 @pytest.mark.parametrize("count", [0, 3, 64, 103])
-def test_a_saved_tree_continues_bit_for_bit(stream, count, kind):
+def test_saved_tree_continues_bit_for_bit(stream, count, kind):
     tree = grown(stream[:count], kind=kind)
     loaded = kind.from_state(*tree.state())
     for each in (tree, loaded):
@@ -144,7 +144,7 @@ def test_a_saved_tree_continues_bit_for_bit(stream, count, kind):
 
 
 @KINDS
-def test_a_reduction_that_is_interrupted_loses_no_node(stream, kind, monkeypatch):
+def test_interrupted_reduction_loses_no_node(stream, kind, monkeypatch):
     def interrupted(*_):
         raise KeyboardInterrupt
 
@@ -172,7 +172,7 @@ def test_rows_shorter_than_a_reduction_stay_within_the_bound(kind, width, rng):
     [np.ones((3, 5)), np.ones(6), np.full((2, 6), np.nan), np.full((2, 6), np.inf)],
     ids=["longer", "flat", "nan", "inf"],
 )
-def test_invalid_rows_are_rejected_and_do_not_change_the_tree(rows):
+def test_invalid_rows_are_an_error_and_change_nothing(rows):
     tree = grown(whole_numbers(14, seed=1), size=4)
     before = bits(tree)
     with pytest.raises(ProtocolError, match=r"expected rows float32 \(k, 6\)|insert finite rows"):
@@ -180,7 +180,7 @@ def test_invalid_rows_are_rejected_and_do_not_change_the_tree(rows):
     assert bits(tree) == before
 
 
-def test_trees_of_other_sizes_or_rows_are_rejected():
+def test_trees_of_other_sizes_or_lengths_are_not_merged():
     tree = grown(np.ones((9, 6)), size=4)
     with pytest.raises(ProtocolError, match=r"size 4 .* size 5"):
         tree.merged(grown(np.ones((9, 6)), size=5))
@@ -195,7 +195,7 @@ def test_a_sample_has_at_most_2n_rows(count, size):
     assert len(summary.rows) >= size or count < size
 
 
-def test_a_node_gives_its_strongest_n_rows_times_2_to_the_level_below_the_top(stream):
+def test_sample_has_half_as_many_rows_of_each_lower_level(stream):
     tree = grown(stream)
     rows, start = sample(tree.nodes, SIZE), 0
     assert [node.level for node in tree.nodes] == [3, 2, 0]
@@ -209,14 +209,7 @@ def test_a_node_gives_its_strongest_n_rows_times_2_to_the_level_below_the_top(st
     assert start == len(rows)
 
 
-def test_each_row_weighs_one_original_row(rng):
-    """A stream of one row again and again is sampled as that row, whatever its age."""
-    row = rng.uniform(size=30).astype(np.float32)
-    rows = grown(np.tile(row, (SIZE * 13, 1))).sample().rows
-    assert_allclose(rows, np.tile(row, (len(rows), 1)), rtol=1e-4)
-
-
-def test_means_and_counts_are_those_of_all_rows_pending_ones_too(stream):
+def test_mean_and_count_of_a_sample_include_pending_rows(stream):
     rows = stream[:205]
     summary = grown(rows).sample()
     assert summary.count == 205
@@ -225,7 +218,7 @@ def test_means_and_counts_are_those_of_all_rows_pending_ones_too(stream):
 
 
 @given(st.lists(st.integers(0, 40), max_size=12), st.integers(0, 2**32 - 1))
-def test_a_sample_after_many_others_is_that_of_a_tree_that_made_none(cuts, seed):
+def test_sample_does_not_depend_on_earlier_samples(cuts, seed):
     rows = np.random.default_rng(seed).normal(size=(sum(cuts), 9)).astype(np.float32)
     tree, start = CoresetTree(4), 0
     for count in cuts:

@@ -1,4 +1,4 @@
-"""Two objects do not claim the same place of a frame, unless they were together from the start."""
+"""Two objects are not at the same position of a frame, unless they were together from the start."""
 
 from dataclasses import replace
 from itertools import combinations
@@ -26,50 +26,50 @@ def state(x, first_frame=0):
 
 UNCERTAIN = ["lost", "redetected", "weak"]
 LEVELS = ["confident", *UNCERTAIN]
-APART = {"anna": state(20), "ben": state(200)}
+DISJOINT = {"anna": state(20), "ben": state(200)}
 
 
 def detection(score, x, around=None):
     return Detection(score, Window.around(Box(x, 50, 40, 40)), around)
 
 
-def scores_around(x, beside):
-    """Scores of 0.1, but for the windows 25 pixels to the left."""
+def scores_around(x, left):
+    """Scores of 0.1, except for the windows 25 pixels to the left."""
     scores = np.full((3, 9), 0.1, np.float32)
-    scores[:, 0] = beside
+    scores[:, 0] = left
     return ScoreMap(None, scores, (x - 25.0, 45.0), (5.0, 5.0))
 
 
-def test_detections_at_different_places_stay_the_same():
+def test_disjoint_detections_stay_the_same():
     detections = {"anna": detection(0.9, 100), "ben": detection(0.8, 120)}
-    assert assign(detections, APART) == detections
+    assert assign(detections, DISJOINT) == detections
     assert assign({}, {}) == {}
 
 
 @pytest.mark.parametrize("order", [("anna", "ben"), ("ben", "anna")])
-def test_of_two_objects_at_one_place_the_one_with_the_higher_score_keeps_it(order):
+def test_contested_position_belongs_to_the_higher_score(order):
     both = {"anna": detection(0.9, 100), "ben": detection(0.8, 104)}
     detections = {name: both[name] for name in order}
-    result = assign(detections, APART)
+    result = assign(detections, DISJOINT)
     assert result["anna"] is detections["anna"]
     assert result["ben"].score == 0
     assert list(result) == list(order)
 
 
-def test_of_three_objects_in_a_row_two_that_are_apart_keep_their_places():
-    """The one in the middle is at the place of both; in another order, it keeps its place, and they lose theirs."""
+def test_object_between_two_keeps_its_position_or_they_do():
+    """The one in the middle is at the position of both."""
     states = {name: state(100 * i) for i, name in enumerate(("left", "right", "middle"))}
-    for middle, kept in ((0.7, {"left", "right"}), (0.95, {"middle"})):
+    for middle, expected in ((0.7, {"left", "right"}), (0.95, {"middle"})):
         detections = {"left": detection(0.9, 100), "right": detection(0.8, 124), "middle": detection(middle, 112)}
         result = assign(detections, states)
-        assert {name for name, each in result.items() if each.score > 0} == kept
+        assert {name for name, each in result.items() if each.score > 0} == expected
 
 
 @given(
     st.lists(st.tuples(st.floats(0.1, 1), st.integers(80, 140), st.sampled_from(LEVELS)), min_size=2, max_size=5),
     st.randoms(),
 )
-def test_no_two_objects_ever_have_one_place(objects, random):
+def test_no_two_objects_have_the_same_position(objects, random):
     def around(x):
         scores = np.array([[random.random() for _ in range(9)] for _ in range(3)], np.float32)
         return ScoreMap(None, scores, (x - 20.0, 40.0), (5.0, 5.0))
@@ -82,7 +82,7 @@ def test_no_two_objects_ever_have_one_place(objects, random):
     assert all(one.overlap(other) <= 0.5 for one, other in combinations(boxes, 2))
 
 
-def test_an_object_gives_way_to_an_assigned_one_of_lower_score():
+def test_object_yields_to_an_assigned_one_of_lower_score():
     detections = {
         "anna": detection(0.8, 108, scores_around(108, 0.1)),
         "ben": detection(0.8, 108, scores_around(108, 0.55)),
@@ -92,47 +92,47 @@ def test_an_object_gives_way_to_an_assigned_one_of_lower_score():
     assert [name for name, each in result.items() if each is detections[name]] == ["carl"]
 
 
-def test_objects_that_are_together_may_stay_at_one_place():
+def test_objects_that_are_together_share_a_position():
     detections = {"anna": detection(0.9, 100), "ben": detection(0.8, 104)}
     later = state(110, first_frame=7)
-    assert assign(detections, APART | {"ben": replace(later, together={"anna": 0})}) == detections
-    assert assign(detections, APART | {"ben": later})["ben"].score == 0
+    assert assign(detections, DISJOINT | {"ben": replace(later, together={"anna": 0})}) == detections
+    assert assign(detections, DISJOINT | {"ben": later})["ben"].score == 0
     of_another_anna = replace(later, together={"anna": 3})
-    assert assign(detections, APART | {"ben": of_another_anna})["ben"].score == 0
+    assert assign(detections, DISJOINT | {"ben": of_another_anna})["ben"].score == 0
 
 
 @pytest.mark.parametrize(("side", "score"), [(40, 0.7), (40, 0.9), (15, 0.9)])
 @pytest.mark.parametrize(
-    ("level", "redetected", "kept"),
+    ("level", "redetected", "keeps"),
     [("confident", False, True), ("confident", True, False), *[(level, False, False) for level in UNCERTAIN]],
 )
-def test_an_uncertain_object_gets_no_part_of_the_place_of_another(side, score, level, redetected, kept):
+def test_uncertain_object_gets_no_part_of_another(side, score, level, redetected, keeps):
     part = Window.around(Box(122, 60, side, side))
     detections = {"anna": detection(0.8, 100), "ben": Detection(score, part, redetected=redetected)}
-    result = assign(detections, APART | {"ben": replace(APART["ben"], level=level)})
+    result = assign(detections, DISJOINT | {"ben": replace(DISJOINT["ben"], level=level)})
     assert result["anna"] is detections["anna"]
-    assert (result["ben"].score > 0) is kept
+    assert (result["ben"].score > 0) is keeps
 
 
 @pytest.mark.parametrize(("score", "winner"), [(0.6, "anna"), (1.0, "anna"), (1.2, "ben")])
-def test_an_uncertain_object_displaces_a_certain_one_only_with_a_clearly_higher_score(score, winner):
-    """The certain one has nearly as good a window beside it, so its score would fall less."""
+def test_uncertain_object_displaces_only_by_a_clear_lead(score, winner):
+    """The certain one has nearly as good a window next to it, so its score would fall less."""
     detections = {
         "anna": detection(0.7, 100, scores_around(100, 0.65)),
         "ben": detection(score, 104, scores_around(104, 0.1)),
     }
-    result = assign(detections, APART | {"ben": replace(APART["ben"], level="redetected")})
+    result = assign(detections, DISJOINT | {"ben": replace(DISJOINT["ben"], level="redetected")})
     assert result[winner] is detections[winner]
     assert [name for name in detections if result[name] is detections[name]] == [winner]
 
 
-def test_an_object_that_loses_its_place_takes_the_best_other_window_near_it(rng):
+def test_object_that_loses_its_position_gets_the_next_best(rng):
     frame = Pyramid(rng.integers(0, 256, (200, 300, 3), np.uint8))
     window = Window.around(Box(100, 50, 40, 40))
     row = ScoreMap.around(frame, window, WINDOW, None).cells.row(0, 0)
     detection_of_ben = local_search(FrameContext(frame, Model(1, 0, row, 0.0), Settings()), window)
     detection_of_ben = replace(detection_of_ben, redetected=True)
-    result = assign({"anna": Detection(1e9, detection_of_ben.window), "ben": detection_of_ben}, APART)["ben"]
+    result = assign({"anna": Detection(1e9, detection_of_ben.window), "ben": detection_of_ben}, DISJOINT)["ben"]
     assert 0 < result.score < detection_of_ben.score
     assert result.window.box().overlap(detection_of_ben.window.box()) <= 0.5
     assert result.around is detection_of_ben.around

@@ -20,12 +20,8 @@ ACTIONS = ("report", "resize", "teach")
 SCORES = st.floats(-1, 2, width=32)
 LEVELS = st.sampled_from(["lost", "redetected", "weak", "confident"])
 
-
-@st.composite
-def states(draw):
-    """Any state of a detector that has found its object."""
-    level, trusted = draw(LEVELS), draw(st.booleans())
-    return DetectorState(0, level, WINDOW, WINDOW, WINDOW, trusted)
+#: All states of a detector that has found its object.
+STATES = st.builds(DetectorState, st.just(0), LEVELS, *[st.just(WINDOW)] * 3, st.booleans())
 
 
 def done(level):
@@ -40,21 +36,21 @@ def searches(level):
 
 
 @given(SCORES, SCORES, st.booleans())
-def test_a_higher_score_allows_all_that_a_lower_one_does_and_searches_no_more_often(one, other, trusted):
+def test_higher_score_allows_more_and_searches_less(one, other, trusted):
     low, high = (belief.level_of(score, trusted, BELIEF) for score in sorted((one, other)))
     assert done(low) <= done(high)
     assert searches(low) >= searches(high)
 
 
 @given(SCORES)
-def test_trust_allows_to_train_and_searches_no_more_often(score):
+def test_trust_allows_training_and_searches_less(score):
     doubted, trusted = (belief.level_of(score, each, BELIEF) for each in (False, True))
     assert "teach" not in done(doubted)
     assert searches(doubted) >= searches(trusted)
 
 
-@given(states(), SCORES, st.booleans())
-def test_a_lost_object_needs_at_least_the_score_to_return_that_it_needs_to_stay(state, score, redetected):
+@given(STATES, SCORES, st.booleans())
+def test_lost_object_needs_a_higher_score_to_return(state, score, redetected):
     lost, present = (
         belief.update_level(dataclasses.replace(state, level=level), score, redetected, BELIEF).level
         for level in ("lost", "weak")
@@ -62,14 +58,14 @@ def test_a_lost_object_needs_at_least_the_score_to_return_that_it_needs_to_stay(
     assert present != "lost" or lost == "lost"
 
 
-@given(states(), SCORES, st.booleans())
-def test_an_object_is_distrusted_from_its_redetection_until_it_scores_high(state, score, redetected):
+@given(STATES, SCORES, st.booleans())
+def test_redetected_object_is_distrusted_until_a_high_score(state, score, redetected):
     after = belief.update_level(state, score, redetected, BELIEF)
     assert after.trusted == (score >= BELIEF.trusted_score or (state.trusted and not redetected))
     assert (after.level == "redetected") == (not after.trusted and after.level != "lost")
 
 
-def test_an_object_that_was_never_found_is_lost_whatever_it_scores():
+def test_object_without_a_detection_is_lost_at_any_score():
     state = DetectorState(0, "lost", WINDOW, WINDOW, None)
     assert belief.update_level(state, 2.0, False, BELIEF).level == "lost"
 
@@ -88,7 +84,7 @@ def moving(motion: Motion, frames: int = 60) -> np.ndarray:
     return estimate
 
 
-def test_a_lost_object_coasts_to_a_stop(motion):
+def test_lost_object_coasts_to_a_stop(motion):
     estimate = moving(motion)
     (x, y, *velocity), *_ = estimate
     for _ in range(500):
@@ -97,7 +93,7 @@ def test_a_lost_object_coasts_to_a_stop(motion):
     assert np.hypot(*(estimate[0, :2] - (x, y))) < 5.01 * np.hypot(*velocity)
 
 
-def test_an_object_that_reappears_has_a_higher_belief_than_one_that_never_left(motion):
+def test_reappearing_object_follows_its_measurement_more(motion):
     never_left, back = moving(motion), moving(motion)
     for _ in range(30):
         back = predict(back, motion, lost=True)
@@ -109,6 +105,6 @@ def test_an_object_that_reappears_has_a_higher_belief_than_one_that_never_left(m
     assert shares[0] < 0.3 < 0.6 < shares[1]
 
 
-def test_a_jump_is_a_new_start_at_rest(motion):
+def test_jump_is_a_new_start_at_rest(motion):
     estimate = update(predict(moving(motion), motion), motion, (40, 40))
     np.testing.assert_array_equal(estimate, at_rest((40, 40), motion))

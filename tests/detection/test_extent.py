@@ -26,7 +26,7 @@ def draw(texture):
 
 
 @pytest.mark.parametrize(("w", "h"), [(84, 60), (60, 84), (84, 84)], ids=["wider", "higher", "larger"])
-def test_the_box_follows_an_object_that_gets(draw, w, h, monkeypatch):
+def test_box_adapts_to_an_object_that_gets(draw, w, h, monkeypatch):
     monkeypatch.setattr(extent, "_PRIOR", 0.0)
     tracker, frames = Tracker(), 80
     tracker.init(*draw(60, 60))
@@ -37,7 +37,7 @@ def test_the_box_follows_an_object_that_gets(draw, w, h, monkeypatch):
     assert Box(0, 0, 60, 60).centred(*truth.centre).overlap(truth) < 0.75, "had it stayed"
 
 
-def test_in_a_frame_that_does_not_change_the_box_keeps_its_size(draw):
+def test_box_keeps_its_size_in_a_still_frame(draw):
     tracker, (image, truth) = Tracker(), draw(60, 60)
     tracker.init(image, truth)
     for _ in range(8):
@@ -45,7 +45,7 @@ def test_in_a_frame_that_does_not_change_the_box_keeps_its_size(draw):
     assert box.area == pytest.approx(truth.area, rel=0.04)
 
 
-def test_if_the_belief_is_low_only_the_place_is_followed_unless_the_window_is_redetected():
+def test_low_belief_moves_the_box_without_a_new_size():
     near, elsewhere = (WINDOW.scaled(factor).centred(90, 80) for factor in (1.1, 1.5))
     assert extent.smooth(WINDOW, near, resize=False) == pytest.approx(WINDOW.centred(90, 80))
     assert extent.smooth(WINDOW, elsewhere, resize=False) == elsewhere

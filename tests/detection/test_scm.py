@@ -6,7 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose, assert_array_equal
+from numpy.testing import assert_allclose
 from sklearn.decomposition import sparse_encode
 from sklearn.svm import OneClassSVM
 
@@ -15,7 +15,6 @@ from catstream.detection import scm
 from catstream.detection.scm import SparseCollaborativeModel
 from catstream.errors import ProtocolError
 from catstream.training.one_class import one_class
-from catstream.video import rendered
 
 START = Box(60, 50, 48, 40)
 
@@ -37,25 +36,19 @@ def test_codes_are_those_of_scikit_learn(rng, centre):
     np.testing.assert_allclose(codes, expected, atol=1e-3)
 
 
-def test_the_demos_object_is_followed():
-    frames, truth = zip(*rendered.render(40, (320, 240)), strict=True)
-    found = followed(frames, truth[0])
-    assert min(found_box.overlap(box) for (_, found_box), box in zip(found, truth[1:], strict=True)) > 0.5
-
-
-def test_a_half_covered_object_is_tracked(scene):
+def test_half_covered_object_is_tracked(scene):
     ways = [((60 + 2 * i, 50 + i), 0.4 if 4 <= i < 12 else 0.0) for i in range(16)]
     found = followed(itertools.starmap(scene, ways), START)
     overlaps = [box.overlap(Box(*at, 48, 40)) for (_, box), (at, _) in zip(found, ways[1:], strict=True)]
     assert min(overlaps) > 0.5
 
 
-def test_the_score_falls_if_the_object_is_absent(scene):
+def test_score_falls_if_the_object_is_absent(scene):
     (there, _), (gone, _) = followed([scene((60, 50)), scene((62, 51)), scene((250, 180))], START)
     assert there > 0.6 > 0.5 > gone
 
 
-def test_warnings_have_the_same_filters_after_several_threads_have_trained(rng):
+def test_training_in_threads_keeps_the_filters_of_warnings(rng):
     cuts = rng.integers(0, 256, (2, 20, 32, 32), np.uint8)
     before = list(warnings.filters)
     with ThreadPoolExecutor(4) as pool:
@@ -63,17 +56,17 @@ def test_warnings_have_the_same_filters_after_several_threads_have_trained(rng):
     assert warnings.filters == before
 
 
-def test_the_same_seed_gives_the_same_boxes_and_another_others(scene):
+def test_boxes_depend_on_the_seed_only(scene):
     frames = [scene((60 + 3 * i, 50 + 2 * i)) for i in range(7)]
     assert followed(frames, START, seed=1) == followed(frames, START, seed=1) != followed(frames, START, seed=2)
 
 
-def test_a_frame_without_any_contrast_is_survived():
+def test_frame_without_contrast_has_a_finite_score():
     ((score, box),) = followed(np.zeros((2, 120, 160, 3), np.uint8), START)
     assert np.isfinite([score, *box]).all()
 
 
-def test_an_object_that_leaves_stays_a_box_in_the_frame(scene):
+def test_box_of_a_leaving_object_has_its_centre_in_the_frame(scene):
     frames = [np.roll(scene((60, 50)), -8 * i, axis=1)[:, :160] for i in range(12)]
     assert all(0 <= box.centre[0] < 160 for _, box in followed(frames, START))
 
@@ -92,22 +85,16 @@ def rows(rng) -> np.ndarray:
     return rows_around(rng.uniform(size=300), 96, rng)
 
 
-@pytest.mark.parametrize("nu", [0.05, 0.5, 0.95])
-def test_decides_as_the_linear_kernel_does(rows, background, nu):
+@pytest.mark.parametrize("nu", [0.05, 0.95])
+def test_one_class_model_decides_as_the_linear_kernel(rows, background, nu):
     origin = background.mean(axis=0)
     machine = OneClassSVM(kernel="linear", nu=nu).fit(rows - origin)
     expected = machine.decision_function(background - origin) + machine.offset_
     assert_allclose((background - origin) @ one_class(rows, origin, nu), expected, rtol=1e-5, atol=1e-5 * len(rows))
 
 
-def test_same_rows_same_bits(rows, background):
-    first, second = (one_class(rows.copy(), background.mean(axis=0)) for _ in range(2))
-    assert first.dtype == np.float32
-    assert_array_equal(first, second)
-
-
 @pytest.mark.parametrize("count", [0, 1, 5])
-def test_rows_equal_to_the_background_are_rejected(background, count):
+def test_rows_equal_to_the_background_are_an_error(background, count):
     origin = background.mean(axis=0)
     with pytest.raises(ProtocolError, match="differs from the background"):
         one_class(np.tile(origin, (count, 1)), origin)

@@ -13,7 +13,7 @@ from catstream.features.score_map import ScoreMap, non_maximum_suppression
 from catstream.wire.messages import Model
 
 
-def test_the_window_of_a_score_lies_in_the_frame_and_place_is_its_inverse(image):
+def test_window_and_place_of_a_score_are_inverse(image):
     window = Window(30, 40, 50, 70)
     scores = ScoreMap.around(Pyramid(image), window, 20, None)
     assert scores.window(6, 6) == pytest.approx(window)
@@ -29,13 +29,13 @@ def test_windows_of_a_region_lie_in_it(image, rng):
 
 
 @given(st.integers(0, 10**6), st.integers(1, 30), st.integers(1, 60))
-def test_each_part_is_due_once_in_an_interval_or_in_as_many_frames_as_parts(seq, interval, count):
+def test_each_part_is_searched_once_in_an_interval(seq, interval, count):
     frames = max(interval, count)
     parts = [part for number in range(seq, seq + frames) if (part := due_part(number, interval, count)) is not None]
     assert sorted(parts) == list(range(count))
 
 
-def test_a_maximum_between_cells_is_interpolated_from_its_neighbours(image):
+def test_maximum_between_cells_is_interpolated(image):
     row, column = np.mgrid[:9, :9]
     scores = (1 - 0.01 * ((row - 4.3) ** 2 + (column - 3.8) ** 2)).astype(np.float32)
     found = ScoreMap(Cells.of(image[:128, :128]), scores, (0, 0), (1, 1))
@@ -43,7 +43,7 @@ def test_a_maximum_between_cells_is_interpolated_from_its_neighbours(image):
     assert (window.y, window.x) == pytest.approx((4.3, 3.8), abs=1e-3)
 
 
-def test_maxima_suppress_their_neighbours_and_stop_at_the_threshold(rng):
+def test_maxima_suppress_their_neighbours(rng):
     scores = rng.normal(size=(30, 40)).astype(np.float32)
     found = non_maximum_suppression(scores, 12, radius=3)
     values = [scores[place] for place in found]

@@ -19,11 +19,6 @@ OBJECT = Window(120, 80, 64, 64)
 SETTINGS = Settings()
 
 
-@pytest.fixture(autouse=True)
-def many_near_misses(monkeypatch):
-    monkeypatch.setattr(teacher, "_NEAR_MISSES", 200)
-
-
 @pytest.fixture
 def frame(texture):
     return Pyramid(texture(240, 320, 12))
@@ -41,13 +36,8 @@ def cut(frame, model, around=None, window=OBJECT):
     return rows, own, (rows.labels > 0) & ~own, rows.labels == 0
 
 
-def places(scored, rows):
-    """Row and column of the windows that feature rows were taken from."""
-    rows = {row.tobytes() for row in rows}
-    return [place for place in np.ndindex(scored.scores.shape) if scored.cells.row(*place).tobytes() in rows]
-
-
-def test_the_label_of_a_near_miss_is_a_gaussian_of_its_distance_which_is_most_of_a_cell_or_more(frame, model):
+def test_label_of_a_near_miss_is_a_gaussian_of_its_distance(frame, model, monkeypatch):
+    monkeypatch.setattr(teacher, "_NEAR_MISSES", 200)
     around = ScoreMap.around(frame, OBJECT, 20, model)
     window = OBJECT.centred(OBJECT.centre[0] + 4, OBJECT.centre[1] - 3)  # half a cell of 8 pixels, and less
     rows, _, misses, _ = cut(frame, model, around, window)
@@ -62,18 +52,18 @@ def test_the_label_of_a_near_miss_is_a_gaussian_of_its_distance_which_is_most_of
     np.testing.assert_allclose(rows.labels[misses], np.exp(-((np.array(near) / 0.9) ** 2) / 2), rtol=1e-5)
 
 
-def test_background_is_beyond_the_near_misses_and_half_of_it_scores_highest(frame, model):
+def test_background_is_distant_and_has_the_highest_score(frame, model):
     around = ScoreMap.around(frame, OBJECT, 20, model)
     rows, _, _, background = cut(frame, model, around)
     assert background.sum() == 12
-    taken = places(around, rows.rows[background])
-    assert all(max(abs(row - 6), abs(column - 6)) > 2 for row, column in taken)
-    outside = [place for place in np.ndindex(13, 13) if max(abs(place[0] - 6), abs(place[1] - 6)) > 2]
-    best = max(outside, key=lambda place: around.scores[place])
-    assert best in taken
+    cuts = {features.tobytes() for features in rows.rows[background]}
+    cells = [cell for cell in np.ndindex(around.scores.shape) if around.cells.row(*cell).tobytes() in cuts]
+    distances = np.abs(np.subtract([*np.ndindex(13, 13)], 6)).max(axis=1).reshape(13, 13)
+    assert all(distances[cell] > 2 for cell in cells)
+    assert np.unravel_index(np.where(distances > 2, around.scores, -np.inf).argmax(), (13, 13)) in cells
 
 
-def test_an_object_at_the_edge_of_the_search_area_is_learned_from_too(frame, model):
+def test_object_at_the_edge_of_the_search_area_has_all_rows(frame, model):
     around = ScoreMap.around(frame, OBJECT, 20, model)
     edge = around.window(0, 12)
     rows, own, misses, background = cut(frame, model, around, edge)
@@ -83,7 +73,7 @@ def test_an_object_at_the_edge_of_the_search_area_is_learned_from_too(frame, mod
     assert np.isfinite(rows.rows).all()
 
 
-def test_a_wrong_size_or_aspect_ratio_is_labelled_with_its_steps_and_their_gaussian(frame, model):
+def test_wrong_extent_is_labelled_with_a_gaussian_of_its_steps(frame, model):
     settings = SETTINGS.replace({"extent.size_count": 5})
     training = teacher.training_at(FrameContext(frame, model, settings, 3), OBJECT)
     own = Cells.within(frame.around(OBJECT, WINDOW)).row(0, 0)
@@ -96,12 +86,12 @@ def test_a_wrong_size_or_aspect_ratio_is_labelled_with_its_steps_and_their_gauss
         assert extents.offsets[:, column] == pytest.approx([0.5 + k / 16 for k in steps])
 
 
-def test_without_learning_the_extent_there_are_no_rows_of_it(frame, model):
+def test_extent_that_is_not_learned_has_no_rows(frame, model):
     settings = SETTINGS.replace({"extent.learned": False})
     assert set(teacher.training_at(FrameContext(frame, model, settings, 3), OBJECT)) == {APPEARANCE}
 
 
-def test_hard_negatives_score_highest_and_do_not_show_the_object(frame, model):
+def test_hard_negatives_score_high_and_exclude_the_object(frame, model):
     rows = teacher.hard_negatives(FrameContext(frame, model, SETTINGS), OBJECT)
     scores = rows.rows @ model.weights
     assert 0 < len(rows) <= SETTINGS.training.hard_negatives
@@ -111,7 +101,7 @@ def test_hard_negatives_score_highest_and_do_not_show_the_object(frame, model):
     assert min(np.abs(rows.rows - own).max(axis=1)) > 0.01
 
 
-def test_colours_that_are_not_used_are_0_in_every_row(frame, model):
+def test_disabled_colours_are_zero_in_every_row(frame, model):
     for used in (True, False):
         settings = SETTINGS.replace({"training.colours": used})
         first, training = teacher.first_training(frame, OBJECT, np.random.default_rng(1), settings)
@@ -120,7 +110,7 @@ def test_colours_that_are_not_used_are_0_in_every_row(frame, model):
         assert first.weights[COLOURS].any() == used
 
 
-PLACE = Window(64, 48, 64, 64)
+BOX = Window(64, 48, 64, 64)
 
 
 def copies(image, window, count, seed=0, **how):
@@ -128,38 +118,38 @@ def copies(image, window, count, seed=0, **how):
 
 
 @pytest.mark.parametrize("moved", [0.0, 0.5])
-def test_copies_are_seeded_and_the_first_is_the_window(image, moved):
-    one, two = (copies(image, PLACE, 5, 7, moved=moved) for _ in range(2))
+def test_copies_depend_on_the_seed_and_begin_with_the_window(image, moved):
+    one, two = (copies(image, BOX, 5, 7, moved=moved) for _ in range(2))
     np.testing.assert_array_equal(one, two)
     np.testing.assert_array_equal(one[0], Cells.of(image).row(6, 8))
     assert np.abs(one[1:] - one[0]).max(axis=1).min() > 0
 
 
 @pytest.mark.parametrize(("moved", "changed"), [(0.0, 0), (0.25, 2), (0.5, 4), (1.0, 8)])
-def test_a_share_of_them_is_put_on_another_background(rng, moved, changed):
+def test_share_of_the_copies_has_another_background(rng, moved, changed):
     image = np.full((200, 240, 3), 60, np.uint8)
     image[:, 128:] = 250  # beside the box
     image[60:100, 76:116] = rng.integers(0, 256, (40, 40, 3), np.uint8)
-    plain = copies(image, PLACE, 9)
-    rows = copies(image, PLACE, 9, moved=moved)
+    plain = copies(image, BOX, 9)
+    rows = copies(image, BOX, 9, moved=moved)
     differ = np.abs(rows - plain).max(axis=1) > 0.5
     assert not differ[0]
     assert differ.sum() <= changed
     assert (changed == 0) or differ.any()
 
 
-def test_on_another_background_the_object_keeps_its_centre(rng):
+def test_object_keeps_its_centre_on_another_background(rng):
     image = rng.integers(0, 256, (200, 240, 3), np.uint8)
     image[40:120, 56:136] = 60
-    plain, moved = (copies(image, PLACE, 2, moved=share)[1].copy() for share in (0.0, 1.0))
+    plain, moved = (copies(image, BOX, 2, moved=share)[1].copy() for share in (0.0, 1.0))
     grids = [row[: 8 * 8 * 34].reshape(8, 8, 34) for row in (plain, moved)]
     np.testing.assert_allclose(grids[0][3:5, 3:5], grids[1][3:5, 3:5], atol=1e-3)
 
 
-def test_the_last_copies_are_mirrored_and_never_the_window_itself(image):
-    plain, some = (copies(image, PLACE, 6, mirrored=count) for count in (0, 2))
+def test_last_copies_are_mirrored_but_never_the_window(image):
+    plain, some = (copies(image, BOX, 6, mirrored=count) for count in (0, 2))
     np.testing.assert_array_equal(some[:4], plain[:4])
     np.testing.assert_allclose(some[4:, COLOURS], plain[4:, COLOURS], atol=1e-6)
     ours, theirs = (rows[4:, : COLOURS.start].reshape(2, 8, 8, 34)[..., 31:] for rows in (some, plain))
     np.testing.assert_allclose(ours, theirs[:, :, ::-1], atol=1e-5)
-    np.testing.assert_array_equal(copies(image, PLACE, 2, mirrored=9)[0], copies(image, PLACE, 1)[0])
+    np.testing.assert_array_equal(copies(image, BOX, 2, mirrored=9)[0], copies(image, BOX, 1)[0])
