@@ -87,6 +87,11 @@ def test_update_before_init_is_an_error(video):
         Tracker().update(video[0][0])
 
 
+def test_repr_has_the_frame_and_the_state(video):
+    assert repr(Tracker()) == "<catstream.Tracker, before init>"
+    assert repr(started(video)) == "<catstream.Tracker, at frame 0: the object bootstrapping>"
+
+
 @pytest.mark.parametrize("bad", [None, np.zeros((3, 240, 320), np.uint8), np.zeros((240, 320), bool)])
 def test_invalid_frame_is_an_error_and_changes_nothing(video, bad):
     frames, boxes = video

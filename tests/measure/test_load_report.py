@@ -57,7 +57,9 @@ def test_report_has_its_command_and_a_row_for_each_process(result, tmp_path):
 
 
 def test_chart_has_a_point_for_each_second(result, tmp_path):
-    page = write_report(tmp_path / "report.html", LoadTest([], results=[result([0.1] * 50)]), PROVENANCE).read_text()
+    run = result([0.1] * 50, subscribers=[Receipts(0, "tracks", np.full((2, 50), 0.2), [50, 50], [0, 0])])
+    page = write_report(tmp_path / "report.html", LoadTest([], results=[run]), PROVENANCE).read_text()
+    assert "<h2>Subscribers</h2>" in page
     curves = re.findall(r'points="([^"]*)"', page)
     assert {len(points.split()) for points in curves} == {5}
 

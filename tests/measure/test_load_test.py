@@ -1,15 +1,11 @@
 """Limits and plans, and real runs: pipelines on a camera that does not wait, also if they are ended early."""
 
-import threading
-from contextlib import ExitStack, nullcontext
-
 import numpy as np
 import psutil
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from catstream.base.box import Box
 from catstream.base.settings import Settings
 from catstream.errors import ServiceError, SettingsError
 from catstream.measure import load_test as module
@@ -17,7 +13,6 @@ from catstream.measure.latency import Receipts
 from catstream.measure.load_report import to_json
 from catstream.measure.load_result import Limit, Plan, violations
 from catstream.measure.load_test import find_highest, run_load_test
-from catstream.measure.load_video import Video
 
 
 def children():
@@ -49,32 +44,6 @@ def test_still_before_a_run_is_not_its_first_frame():
     load_test = run_load_test(Plan(rate=1.0, duration=1.0, size=(64, 64), settings=settings), [])
     (stream,) = load_test.result.streams
     assert stream.track[0] > 0
-
-
-def test_stream_starts_once_the_one_before_has_its_models(monkeypatch):
-    events = []
-
-    class Stream:
-        error, address, ready = None, None, threading.Event()
-
-        def __init__(self, number):
-            self.number, self.stop, self.join = number, bool, bool
-            self.ready.set()
-
-        def start(self):
-            events.append(f"start {self.number}")
-
-    class Observed:
-        @property
-        def warmed_up(self):
-            events.append("models")
-            return True
-
-    monkeypatch.setattr(module, "observed", lambda *_: nullcontext(Observed()))
-    with ExitStack() as stack:
-        video = Video([], [], {"": Box(0, 0, 9, 9)}, {}, np.zeros((1, 4)))
-        module._started(Plan(streams=2), [Stream(0), Stream(1)], video, stack, lambda *_: None)
-    assert events == ["start 0", "models", "start 1", "models"]
 
 
 @pytest.fixture

@@ -17,13 +17,8 @@ from catstream.measure.onepass import Run, evaluate
 SETTINGS = Settings()
 
 
-@pytest.fixture
-def longer(sequence) -> Sequence:
-    """It has more boxes than frames."""
-    return Sequence("longer", sequence.path, np.vstack([sequence.boxes, sequence.boxes[:1]]))
-
-
-def test_several_processes_give_the_same_runs_as_one(sequence, longer):
+def test_several_processes_give_the_same_runs_as_one(sequence):
+    longer = Sequence("longer", sequence.path, np.vstack([sequence.boxes, sequence.boxes[:1]]))  # than its frames
     late = Sequence("late", sequence.path, np.vstack([[[np.nan] * 4] * 2, sequence.boxes[2:]]))
     errors: list[CatstreamError] = []
     alone = evaluate([sequence, late], SETTINGS)

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import pytest
 
-from catstream.base.box import Box
 from catstream.errors import BoxError, ObjectError, VideoError
 from catstream.offline import annotation as module
 from catstream.offline import passes
@@ -143,9 +142,9 @@ def test_invalid_boxes_are_an_error(video, boxes, error, message):
         annotate(video, boxes)
 
 
-def test_live_source_is_an_error():
+def test_live_source_is_an_error(truth):
     with pytest.raises(VideoError, match="a live source"):
-        annotate("rtsp://10.0.0.7/stream", {0: Box(1, 2, 30, 40)})
+        annotate("rtsp://10.0.0.7/stream", {0: truth[0]})
 
 
 def test_stored_passes_serve_the_same_video_and_settings(video, truth, both_ends, tmp_path):
