@@ -128,8 +128,12 @@ class PipelineFeed:
 
     def _receive(self, endpoint: Endpoint, subscriptions: dict[str, Subscription[Any]]) -> None:
         """Receive all channels until the pipeline ends or is silent; a channel that has ended is removed."""
-        last_report, has_reported, next_read = monotonic(), False, 0.0
+        last_report, next_read = monotonic(), 0.0
         over = inf  # after the first end, when to stop waiting for the last messages of the others
+        silence = (
+            f"Waiting for the first health report from {endpoint}. The first start after an installation compiles "
+            "kernels, which takes about 10 s."
+        )
         while subscriptions and (now := monotonic()) < over and not self._stopped.is_set():
             # Step 1: receive pictures only while they are looked at.
             is_watched = self.viewers or now - self.pictured < PICTURE_SECONDS
@@ -138,9 +142,10 @@ class PipelineFeed:
             elif not is_watched and "previews" in subscriptions:
                 subscriptions.pop("previews").close()
             # Step 2: wait for a track; look at the other channels less often than tracks may arrive.
-            is_due = now >= next_read
-            next_read = now + READ_SECONDS if is_due else next_read
-            for channel in list(subscriptions) if is_due else [name for name in subscriptions if name == "tracks"]:
+            channels = [*subscriptions.keys() & {"tracks"}]
+            if now >= next_read:
+                channels, next_read = [*subscriptions], now + READ_SECONDS
+            for channel in channels:
                 if (message := _next(subscriptions[channel])) is None:
                     continue
                 now = monotonic()
@@ -148,7 +153,8 @@ class PipelineFeed:
                 if over == inf or not isinstance(message, End):  # the next pipeline may have begun at this endpoint
                     self._call(self.dashboard.take, message, now, subscriptions[channel].run)
                 if channel == "health":
-                    last_report, has_reported = now, True
+                    last_report = now
+                    silence = f"no health report arrived from {endpoint} within {SILENCE_SECONDS:g} s"
                 if isinstance(message, End):
                     # The last health report, with the final size of the trees, and the last picture may follow.
                     over = min(over, now + DRAIN_SECONDS)
@@ -156,12 +162,7 @@ class PipelineFeed:
                     subscriptions.pop(channel).close()
             # Step 3: without health reports, the pipeline is silent.
             if over == inf and monotonic() - last_report > SILENCE_SECONDS:
-                if has_reported:
-                    raise SilenceError(f"no health report arrived from {endpoint} within {SILENCE_SECONDS:g} s")
-                raise SilenceError(
-                    f"Waiting for the first health report from {endpoint}. The first start after an installation "
-                    "compiles kernels, which takes about 10 s."
-                )
+                raise SilenceError(silence)
             if "tracks" not in subscriptions:  # nothing else waits
                 self._stopped.wait(READ_SECONDS)
 
