@@ -170,7 +170,6 @@ class Pipeline:
         self._life: Literal["new", "open", "closed"] = "new"
         self._stack = ExitStack()  # cleans up at the end
         self._supervisor: Supervisor | None = None  # None before the start
-        self._endpoint = ""  # empty before the start
         self._rows = 0  # number of tracks that were received
         self._rest: deque[Track] = deque()  # tracks of the last frame that were not yielded yet
 
@@ -187,34 +186,38 @@ class Pipeline:
             endpoint = stack.enter_context(reserve_endpoint(settings.run.endpoint, folder, settings.run.keys, source))
             if self.state is not None:
                 stack.enter_context(locked_for_run(self.state, self._earlier, self._job))
-            job = self._started(str(endpoint))
+            self._job, first = self._started(str(endpoint))
             state = self.state or folder
             stack.enter_context(saved(self._save_models, state, settings, self.saved_models.append))
-            self._supervisor = Supervisor(job, folder, self._start)
+            self._supervisor = Supervisor(self._job, folder, first)
             stack.callback(self._supervisor.stop)  # before the models are saved, from the compressor's last checkpoint
             self._generation = generation()  # a copy of this process that is forked later does not end the run
-            self._endpoint, self._stack, self._life = str(endpoint), stack.pop_all(), "open"
+            self._stack, self._life = stack.pop_all(), "open"
         return self
 
-    def _started(self, endpoint: str) -> Job:
-        """The job for the processes that are started now.
+    def _started(self, endpoint: str) -> tuple[Job, int]:
+        """The job for the processes that are started now, and the number of the last frame before.
 
-        The times of a live run go on after those before. A pause between two parts of it does not count: nothing
-        measures it if the clock of the machine was set meanwhile.
+        The caller or the checkpoint has that frame. The times of a live run go on after those before. A pause between
+        two parts of it does not count: nothing measures it if the clock of the machine was set meanwhile.
         """
-        passed = 0.0
-        if self.live and self._earlier is not None and self.state is not None:
+        first, passed = 0, 0.0
+        if self._earlier is not None and self.state is not None:
             from catstream.processes.state import position
 
-            passed = max(position(self.state)[1], self.first_time) + self.settings.run.checkpoint_seconds
-        return replace(
+            # Frames of a live source cannot be read again: the checkpoint may be ahead of the tracks.
+            stored = position(self.state) if self.live or self.first_frame is None else (0, 0.0)
+            first = max(stored[0], self.first_frame or 0)
+            passed = max(stored[1], self.first_time) + self.settings.run.checkpoint_seconds
+        job = replace(
             self._job,
             endpoint=endpoint,
             state=self.state,
             resume=self._earlier is not None,
             since=time.monotonic() - passed,
-            first=self._start if self.live else 0,
+            first=first if self.live else 0,
         )
+        return job, first
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
@@ -234,7 +237,7 @@ class Pipeline:
             warnings.warn(text, ResourceWarning, source=self, stacklevel=1)  # last: it may be an error
 
     def __repr__(self) -> str:
-        life = f"at {self._endpoint}" if self._life == "open" else self._life
+        life = f"at {self._job.endpoint}" if self._life == "open" else self._life
         return f"<catstream.Pipeline of {without_password(self.source)!r}, {life}>"
 
     def __iter__(self) -> Iterator[Track]:
@@ -318,9 +321,9 @@ class Pipeline:
         ServiceError
             If the pipeline was not started yet.
         """
-        if not self._endpoint:
+        if not self._job.endpoint:
             raise ServiceError("a pipeline has no endpoint before it has started: use it in a `with`")
-        return self._endpoint
+        return self._job.endpoint
 
     @property
     def totals(self) -> dict[str, int]:
@@ -381,18 +384,6 @@ class Pipeline:
 
         state, _ = run_state(self.health.get("detector", {}))
         return "" if state in ("running", "ended") else state
-
-    @property
-    def _start(self) -> int:
-        """Number of the last frame before the run, which the caller or the checkpoint has."""
-        if self._earlier is None or self.state is None:
-            return 0
-        from catstream.processes.state import position
-
-        # Frames of a live source cannot be read again: the checkpoint may be ahead of the tracks.
-        if self.first_frame is not None and not self.live:
-            return self.first_frame
-        return max(position(self.state)[0], self.first_frame or 0)
 
 
 def _check_exclusive(state: object, resume: object, box: object, model: object) -> None:
