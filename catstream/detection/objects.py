@@ -38,7 +38,8 @@ class Detectors:
     def __init__(self, settings: Settings) -> None:
         if settings.training.bootstrap == "scm":  # two seconds, for sklearn: before there is a frame
             import catstream.detection.scm  # noqa: F401
-        self.settings, self.seq = settings, 0
+        self.settings = settings
+        self.seq = 0
         self.detectors: dict[str, Detector] = {}
 
     def add(self, name: str) -> Detector:
@@ -124,7 +125,7 @@ class Detectors:
         detections = assign(detections, states)
         for name, detector in detectors.items():
             results[name] = detector.update(detections[name], frame, self.seq, time)
-        names = [*self.detectors, *(name for name in results if name not in self.detectors)]
+        names = dict.fromkeys([*self.detectors, *results])
         tracks: dict[str, Track] = {name: results[name][0] for name in names}
         objects = {name: results[name][1] for name in names}
         return Tracks(self.seq - 1, tracks), Features(self.seq - 1, time, objects)

@@ -31,9 +31,9 @@ class _StoppedError(Exception):
 class Session:
     """Changes the boxes of an annotation, while a thread reads the video and runs the missing passes.
 
-    Objects take turns, beginning with the object of the newest box; the passes of the newest box of each run first. The
-    methods may be called from any thread. Use it in a `with`, also more than once: it goes on where it was. The owner
-    of the annotation closes it afterwards.
+    The passes of the objects run in rotation, beginning with the object of the newest box, whose passes run first. The
+    methods may be called from any thread. Use it in a `with`, also more than once: it continues where it was. The
+    caller closes the annotation afterwards.
 
     Parameters
     ----------
@@ -41,33 +41,30 @@ class Session:
     jobs : number of long passes that run at a time, and of all passes less one
     save : function that is called after each change of the keyframes
     write : function that writes the results; called by `finish`
-
-    Attributes
-    ----------
-    revision : number of changes of the keyframes and of what follows
-    decoded : whether the frames of the video are numbered
-    tracks : the newest tracks of the objects, by name
-    next_frames : frames to look at next, but those in stretches that are tracked at present
-    problem : error that ended reading or tracking; None if there is none
-    finished : event that `finish` sets
-    lock : held while the annotation changes
     """
 
     def __init__(
         self, annotation: Annotation, jobs: int, save: Callable[[], object], write: Callable[[], object]
     ) -> None:
-        self.annotation, self._jobs, self._save, self.write = annotation, jobs, save, write
-        self.revision, self.decoded = 0, False
-        self.tracks: dict[str, ObjectTracks] = {}
-        self.next_frames: list[NextFrame] = []
-        self.problem: CatstreamError | None = None
-        self.finished, self.lock = threading.Event(), threading.Condition(threading.RLock())
+        self.annotation = annotation
+        self.write = write
+        self._jobs = jobs
+        self._save = save
+        self.revision = 0  #: number of changes of the keyframes and of what follows
+        self.decoded = False  #: whether the frames of the video are numbered
+        self.tracks: dict[str, ObjectTracks] = {}  #: the newest tracks, by the name of the object
+        self.next_frames: list[NextFrame] = []  #: to look at next, outside the stretches that are being tracked
+        self.problem: CatstreamError | None = None  #: error that ended reading or tracking
+        self.finished = threading.Event()  #: set by `finish`
+        self.lock = threading.Condition(threading.RLock())  #: acquired while the annotation changes
         self._history: list[tuple[str, int | None, dict[str, dict[int, KeyframeBox]]]] = []  # with the boxes before
         self._newest: dict[str, int] = {}  # frame of the newest box of each object
-        self._turns: dict[str, int] = {}  # number of the newest pass of each object, without one its turn is next
+        self._last: dict[str, int] = {}  # number of the newest pass of each object; one without a pass is next
         self._missing: list[Task] = []
         self._running: dict[Future[Any], tuple[Task, Path]] = {}  # with the file that counts its frames
-        self._wakes, self._closed, self._is_damaged = True, False, False
+        self._wakes = True  # whether the missing passes have to be determined
+        self._is_damaged = False  # whether a frame could not be decoded, so that all have to be read again
+        self._closed = False
         annotation.progress = self._check_closed
         annotation.frames.is_threaded = True  # for the pictures of the page
 
@@ -93,7 +90,7 @@ class Session:
         with self.lock:
             before = self.annotation.keyframes
             self._newest[object] = frame
-            self._turns.pop(object, None)
+            self._last.pop(object, None)
             self._change({**before, object: {**before.get(object, {}), frame: box}}, object, frame)
 
     def delete(self, object: str, frame: int | None = None) -> None:
@@ -228,7 +225,7 @@ class Session:
             if task not in self._missing:
                 self._stop(future)
         while following := self._next_task():
-            self._turns[following.object] = max(self._turns.values(), default=0) + 1
+            self._last[following.object] = max(self._last.values(), default=0) + 1
             future, count = self.annotation.submit(following)
             self._running[future] = following, count
             future.add_done_callback(lambda _: self._wake())
@@ -243,11 +240,11 @@ class Session:
         count.unlink()  # ends it
 
     def _next_task(self) -> Task | None:
-        """The missing pass that starts next: the shortest at the newest box of the object whose turn it is."""
+        """The missing pass that starts next: the shortest at the newest box of the object that has waited longest."""
 
         def order(task: Task) -> tuple[int, bool, int]:
             is_newest = self._newest.get(task.object) in (task.start, task.stop)
-            return self._turns.get(task.object, 0), not is_newest, task.frames
+            return self._last.get(task.object, 0), not is_newest, task.frames
 
         running = [task for task, _ in self._running.values()]
         limit = _LONG if sum(task.frames > _LONG for task in running) >= self._jobs else sys.maxsize
@@ -274,18 +271,15 @@ class Sessions:
     names : names of the videos
     start : function that returns the session of a video by its number; VideoError if it cannot be read
     shares : share of checked frames of each video so far, from 0 to 1
-
-    Attributes
-    ----------
-    names, shares : as of the parameters
-    number : number of the open video
-    opened : sessions of the videos that were opened, by number
     """
 
     def __init__(self, names: Sequence[str], start: Callable[[int], Session], shares: Sequence[float]) -> None:
-        self.names, self.shares, self.number = names, [*shares], 0
-        self._start, self._lock = start, threading.Lock()
-        self.opened: dict[int, Session] = {}
+        self.names = names
+        self.shares = [*shares]
+        self.number = 0  #: of the open video
+        self.opened: dict[int, Session] = {}  #: by the number of the video
+        self._start = start
+        self._lock = threading.Lock()
 
     def __enter__(self) -> Self:
         self.opened[0] = self._start(0).__enter__()

@@ -108,13 +108,11 @@ def resume_at(position: Position, after: int | None, desired: DesiredState, *, l
     """
     # Step 1: the last message of both. Frames of a live source cannot be read again: it continues after the last one
     # that was learned from.
-    if live or after is None:
-        after = position.processed
+    after = position.processed if live or after is None else after
     seq, repeats = sorted((after, position.processed))
     # Step 2: if no object has a model yet, a file is tracked again from the first frame of the first object.
     if not (live or position.versions):
-        seq = min([seq, *(item.begins - 1 for item in desired.objects.values())])
-        return Start(seq, repeats, desired, {})
+        return Start(min([seq, *(item.begins - 1 for item in desired.objects.values())]), repeats, desired, {})
     # Step 3: objects with a model continue. The others begin again at their last known boxes, or are searched for with
     # their saved models.
     trained = position.states.keys() & position.versions.keys()
@@ -140,13 +138,10 @@ def have_arrived(position: Position, desired: DesiredState, arrived: Mapping[str
 
 
 class TrainingLag:
-    """The samples that features have led to: a detector in lockstep, or with `lag_frames`, waits for their models.
-
-    processed  seq of the newest features that the compressor has processed
-    """
+    """The samples that features have led to: a detector in lockstep, or with `lag_frames`, waits for their models."""
 
     def __init__(self, processed: int = 0) -> None:
-        self.processed = processed
+        self.processed = processed  #: seq of the newest features that the compressor has processed
         self._changes: deque[tuple[int, dict[str, int]]] = deque(maxlen=_MOST_SAMPLES)  # seq that led to these versions
         self._newest: dict[str, int] = {}  # the versions of the last reply
         self._due: dict[str, int] = {}  # those that `samples` returned last

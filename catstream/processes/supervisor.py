@@ -49,7 +49,8 @@ class ProcessLog:
     """The log of a process, whose lines begin with its name: it writes to a file, and this class reads that."""
 
     def __init__(self, name: str, file: BinaryIO) -> None:
-        self._mark, self._file = f"{name}: ", file
+        self._mark = f"{name}: "
+        self._file = file
         self._read = 0  # bytes that `new_lines` has returned
         self._begin = 0  # of what the process that runs now has logged
 
@@ -81,20 +82,17 @@ class ProcessLog:
 
 
 class Child:
-    """One process of a run, the file of whose job is `job`.
-
-    process   None if it is to be started when it is `due`
-    hung      whether it was killed because it made no progress
-    silent    seconds since the last iteration of its loop; once it has ended, since its end
-    restarts  moments of its restarts
-    """
+    """One process of a run, the file of whose job is `job`."""
 
     def __init__(self, name: str, job: Path, folder: Path) -> None:
-        self.name, self.job = name, job
-        self.due = self.silent = self._turns = 0.0
-        self.restarts: deque[float] = deque()
-        self.process: StartedProcess | None = None
-        self.hung = False
+        self.name = name
+        self.job = job
+        self.restarts: deque[float] = deque()  #: moments
+        self.process: StartedProcess | None = None  #: None until the moment `start_time`
+        self.start_time = 0.0
+        self.hung = False  #: whether it was killed because it made no progress
+        self.silent = 0.0  #: seconds since the last iteration of its loop; once it has ended, since its end
+        self._iterations = 0.0  # at the last check
         self.memory = SharedMemory()
         self.log = ProcessLog(name, (folder / f"{name}.log").open("w+b"))
 
@@ -130,8 +128,8 @@ class Child:
 
     def check(self, seconds: float) -> bool:
         """Return True if the loop has been stuck for longer than the watchdog limit."""
-        turns, self._turns = self._turns, self.memory.watchdog.turns
-        self.silent = self.silent + seconds if turns == self._turns and self.code is None else 0.0
+        before, self._iterations = self._iterations, self.memory.watchdog.turns
+        self.silent = self.silent + seconds if before == self._iterations and self.code is None else 0.0
         return self.silent > self.memory.watchdog.patience
 
     def end(self) -> None:
@@ -320,7 +318,7 @@ class Supervisor:
         for child in self._children.values():
             code = child.code
             if child.process is None:
-                if now >= child.due:
+                if now >= child.start_time:
                     child.start(self._results.last)
             elif code in ENDED:
                 # Only this one was asked to end, or the detector died after it sent its end and has to repeat it.
@@ -355,7 +353,7 @@ class Supervisor:
             child.start(self._results.last)
         else:
             child.end()
-            child.due = now + RESTART_SECONDS * 2 ** (recent - 2) * random.uniform(0.5, 1)
+            child.start_time = now + RESTART_SECONDS * 2 ** (recent - 2) * random.uniform(0.5, 1)
 
     def _shut_down(self) -> None:
         """End the processes, the detector first, as its last messages need the others; what does not end is killed."""

@@ -40,14 +40,13 @@ _LATE_SECONDS, _CAUGHT_UP_SECONDS = 2.0, 0.5  # latency at which dropping packet
 class Connection:
     """A connection to a camera or a stream, which `frames` opens.
 
-    begin         moment from which `run.open_timeout_seconds` counts
-    rate          frames per second; None if FFmpeg is to measure it, which takes half a second and not in mode "rtp"
-    is_segmented  whether segments of some seconds arrive at once (HLS)
+    begin  moment from which `run.open_timeout_seconds` counts
+    rate   frames per second; None if FFmpeg is to measure it, which takes half a second and not in mode "rtp"
     """
 
     def __init__(self, text: str, settings: RunSettings, attempt: Attempt, begin: float, rate: float | None) -> None:
         self.rate = rate
-        self.is_segmented = False
+        self.is_segmented = False  #: whether segments of some seconds arrive at once (HLS)
         self._text = text
         self._hwaccel = settings.hwaccel
         self._mode = attempt.mode

@@ -220,19 +220,13 @@ class Reader:
 
 
 class Outages:
-    """When and why a source is lost. Each is logged, but a reason at most once in ten minutes: it may last for days.
-
-    name        of the source
-    problem     why the source is lost; empty while it is connected
-    last_frame  arrival of the last frame; before the first one, the start
-    reconnects  number of outages that have ended
-    """
+    """When and why a source is lost. Each is logged, but a reason at most once in ten minutes: it may last for days."""
 
     def __init__(self, name: str, *, is_open: bool) -> None:
         self.name = name
-        self.problem = ""
-        self.last_frame = monotonic()
-        self.reconnects = 0
+        self.problem = ""  #: why the source is lost; empty while it is connected
+        self.last_frame = monotonic()  #: arrival of the last frame; before the first one, the start
+        self.reconnects = 0  #: number of outages that have ended
         self._was_open = is_open  # whether a failure is a loss
         self._has_frame = False
         self._is_logged = False  # whether this outage was logged
