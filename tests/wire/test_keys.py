@@ -28,7 +28,7 @@ CLIENTS = {"watcher": "watch", "operator": "control", "host": "pipeline"}  # nam
 
 #: The clients that may not connect to a channel of each role.
 OUTSIDE = [
-    *((name, who) for name in ("tracks", "control", "all-features") for who in ("none", "wrong", "revoked")),
+    *((name, who) for name in ("tracks", "control", "all-features") for who in ("none", "wrong")),
     ("control", "watcher"),
     ("all-features", "watcher"),
     ("all-features", "operator"),
@@ -137,12 +137,9 @@ def test_damaged_key_file_is_an_error_that_names_it(keys, text):
 
 @pytest.mark.parametrize(("name", "who"), OUTSIDE)
 def test_client_without_permission_receives_nothing_and_is_logged_once(
-    name, who, keys, place, listener, stranger, until, caplog
+    name, who, place, listener, stranger, until, caplog
 ):
     reason = who if who in CLIENTS else ""
-    if who == "revoked":
-        who, reason = "host", Keys.load(keys.parent / "host").public.decode()
-        (keys / "clients" / who).unlink()
     turn, received, before = listener(name), [], rejected()
     one, two = stranger(name, place(who)), stranger(name, place("none" if who == "wrong" else who))
     until(lambda: rejected() >= before + 2, lambda: received.append(turn()))
