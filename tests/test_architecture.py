@@ -125,7 +125,7 @@ def test_imports_follow_the_rule(rule):
         ("import catstream.cli.track", {"asyncio", "filterpy", "rich", "scipy", "numba", "sklearn", "av"}),
     ],
 )
-def test_a_program_starts_without_slow_libraries_that_it_does_not_need(start, unused):
+def test_program_starts_without_unneeded_slow_libraries(start, unused):
     check = f"import sys; {start}; sys.exit({unused!r} & sys.modules.keys() or 0)"
     found = subprocess.run([sys.executable, "-P", "-c", check], capture_output=True, text=True, check=False)
     assert (found.returncode, found.stderr) == (0, "")

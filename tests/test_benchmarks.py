@@ -1,4 +1,4 @@
-"""Every benchmark runs on a few rendered frames, and the parts of the benchmarks of accuracy are right."""
+"""Every benchmark runs on a few rendered frames; the starts and the losses of the robustness benchmark."""
 
 import json
 import math
@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from catstream.base.box import Box
-from catstream.measure.datasets import Sequence, find_sequences
+from catstream.measure.datasets import find_sequences
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 sys.path.append(str(BENCHMARKS))
@@ -30,7 +30,7 @@ CASES = [
 @pytest.mark.system
 @pytest.mark.timeout(600)  # some start many processes, one after the other
 @pytest.mark.parametrize("script", CASES)
-def test_a_benchmark_runs_and_writes_finite_figures(script, tmp_path):
+def test_benchmark_runs_and_writes_finite_figures(script, tmp_path):
     figures = tmp_path / "figures.json"
     subprocess.run([sys.executable, script, "--quick", "--json", figures], cwd=tmp_path, check=True)
     tables = json.loads(figures.read_text())["tables"]
@@ -42,12 +42,8 @@ def test_a_benchmark_runs_and_writes_finite_figures(script, tmp_path):
             assert all(math.isfinite(cell) for cell in row if isinstance(cell, float)), (table["title"], row)
 
 
-@pytest.fixture
-def sequence(walk) -> Sequence:
-    return find_sequences(walk)[0]
-
-
-def test_spatial_starts_are_those_of_cvpr2013_and_jitter_is_within_two_percent(sequence):
+def test_spatial_starts_are_those_of_cvpr2013(walk):
+    (sequence,) = find_sequences(walk)
     x, y, w, h = sequence.boxes[0]
     boxes = np.array([start.box(sequence) for start in spatial(sequence)])
     np.testing.assert_allclose(boxes[8:, 2:], np.outer([0.8, 0.9, 1.1, 1.2], (w, h)))
@@ -71,7 +67,7 @@ def test_spatial_starts_are_those_of_cvpr2013_and_jitter_is_within_two_percent(s
         ([True] * 12 + [None, None, None, None], False),
     ],
 )
-def test_a_run_is_lost_if_less_than_half_of_its_last_quarter_is_followed(followed, lost):
+def test_run_is_lost_if_it_misses_half_of_its_last_quarter(followed, lost):
     truth = np.tile([10.0, 10, 20, 20], (len(followed), 1))
     boxes = np.where(np.array(followed, bool)[:, None], truth, truth + 15)
     truth[[each is None for each in followed]] = np.nan

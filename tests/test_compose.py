@@ -28,12 +28,6 @@ def test_services_have_no_privileges_and_publish_only_the_page_on_loopback():
         assert service.get("network_mode", "none") == "none"
 
 
-def test_example_of_variables_has_each_variable():
-    assert "${" not in re.sub(VARIABLE, "", TEXT)
-    example = re.findall(r"^#?([A-Z_]+)=", (ROOT / ".env.example").read_text(), re.MULTILINE)
-    assert set(example) == {name for name, _ in re.findall(VARIABLE, TEXT)}
-
-
 def test_services_track_an_object_whose_box_is_set_later(folder, tmp_path, until):
     (folder / "run").mkdir(mode=0o700)
     (tmp_path / "tracks").mkdir()

@@ -1,4 +1,4 @@
-"""Optional dependencies: what `pip install catstream` leaves out, and what is said about it."""
+"""Optional dependencies: only a fleet needs them."""
 
 import subprocess
 import sys
@@ -26,7 +26,7 @@ def test_tracking_and_the_help_of_every_command_need_no_extra():
     subprocess.run([sys.executable, "-P", "-c", BASE], check=True)
 
 
-def test_a_missing_extra_is_an_error_with_the_install_command(monkeypatch):
+def test_missing_extra_is_an_error_with_the_install_command(monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(MissingExtraError, match=r'a fleet needs packages .* \(ray\): .* "catstream\[fleet\]"'):
         require_fleet()

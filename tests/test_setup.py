@@ -9,7 +9,7 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 
 
-def test_the_wheel_is_built_without_a_warning_from_every_package_with_the_page_of_the_view(tmp_path):
+def test_wheel_contains_every_package_and_the_page(tmp_path):
     for name in ("pyproject.toml", "README.md", "LICENSE", "catstream"):
         (tmp_path / name).symlink_to(ROOT / name)
     build = "import setuptools.build_meta as build; build.build_wheel('dist')"
