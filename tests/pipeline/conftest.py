@@ -5,17 +5,10 @@ import sys
 from contextlib import ExitStack
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 FRAMES = 32
 SERVICES = Path(__file__).parents[2] / "services"
-
-
-def share_found(tracks, boxes):
-    """The share of the tracks whose box is that of the object."""
-    found = [track.box is not None and track.box.overlap(box) > 0.5 for track, box in zip(tracks, boxes, strict=True)]
-    return np.mean(found)
 
 
 @pytest.fixture(scope="session")

@@ -1,6 +1,4 @@
-"""Pictures for those who look: small, of the newest frame, and none where nobody looks."""
-
-from contextlib import suppress
+"""Previews: small pictures of the newest frame, encoded for subscribers only."""
 
 import cv2
 import numpy as np
@@ -8,7 +6,6 @@ import pytest
 
 from catstream.base.box import Box
 from catstream.client.attach import subscribe
-from catstream.errors import SilenceError
 from catstream.processes.outputs import Previews
 from catstream.video.frames import Frame
 from catstream.video.rendered import render
@@ -22,7 +19,7 @@ def previews(endpoint):
 
 @pytest.fixture
 def looks(endpoint, previews, until):
-    """Somebody begins to look."""
+    """A function that subscribes to the previews."""
 
     def begin():
         reader = subscribe(str(endpoint), "previews", timeout=500)
@@ -32,7 +29,7 @@ def looks(endpoint, previews, until):
     return begin
 
 
-def test_a_preview_shows_the_frame_small_and_contains_its_size(previews, looks):
+def test_preview_shows_the_frame_small_with_its_size(previews, looks):
     ((image, _),) = render(1, (1280, 720))
     with looks() as reader:
         previews.show(7, Frame(9, 0.4, image), {"anna": Box(5.0, 6.0, 70.0, 80.0)})
@@ -49,17 +46,19 @@ def test_preview_is_not_encoded_without_subscribers(previews, monkeypatch):
         previews.show(frame, Frame(frame, frame / 25, np.zeros((48, 64, 3), np.uint8)), {})
 
 
-def test_previews_continue_while_no_object_is_tracked(previews, looks, until):
-    seen = []
+def test_previews_continue_while_no_object_is_tracked(previews, looks, monkeypatch):
+    now = [1.0]
+    monkeypatch.setattr("catstream.processes.outputs.monotonic", lambda: now[0])
     with looks() as reader:
-        reader.timeout = 0
         for grey in (0, 255):
             previews.show(3, Frame(grey, 0.4, np.full((48, 64, 3), grey, np.uint8)), {})
-            until(lambda: seen.extend(_here(reader)) or any(_grey(preview) == grey for preview in seen), previews.turn)  # noqa: B023
-    assert [_grey(preview) for preview in seen] == [0, 255]
+            now[0] += 0.06  # the second one is due 0.1 s after the first
+            previews.turn()
+            jpeg = np.frombuffer(next(reader).jpeg, np.uint8)
+            assert np.median(cv2.imdecode(jpeg, cv2.IMREAD_GRAYSCALE)) == grey
 
 
-def test_frames_of_previews_are_kept_for_five_seconds_while_there_are_subscribers(endpoint, until, monkeypatch):
+def test_frames_are_stored_for_five_seconds_for_subscribers(endpoint, until, monkeypatch):
     monkeypatch.setattr("catstream.processes.outputs._PREVIEW_SECONDS", 0.0)
     with Previews(endpoint, stores=True) as previews:
         with subscribe(str(endpoint), "previews", timeout=500):
@@ -72,13 +71,3 @@ def test_frames_of_previews_are_kept_for_five_seconds_while_there_are_subscriber
             previews.show(3, Frame(80, 8.0, np.zeros((48, 64, 3), np.uint8)), {})
             assert [frame.number for frame in previews.since(7.8)] == [78, 79, 80]
         until(lambda: not previews.since(7.8), previews.turn)
-
-
-def _grey(preview):
-    return int(np.median(cv2.imdecode(np.frombuffer(preview.jpeg, np.uint8), cv2.IMREAD_GRAYSCALE)))
-
-
-def _here(reader):
-    """What has come already."""
-    with suppress(SilenceError):
-        yield from reader

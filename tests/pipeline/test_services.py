@@ -29,7 +29,7 @@ from catstream.wire.newest import Subscriber
 
 @pytest.fixture
 def by_hand(service, folder):
-    """Starts processes of a run by hand, in an order; what is learned is kept in `folder`."""
+    """Starts processes of a run by hand, in an order; the checkpoints are in `folder`."""
 
     def start(*source, box, order=("compressor", "trainer", "detector"), endpoint=folder):
         words = {"compressor": ["--state", folder], "trainer": [], "detector": [*source, "--box", box]}
@@ -38,7 +38,7 @@ def by_hand(service, folder):
     return start
 
 
-def test_processes_started_manually_in_any_order_complete_a_run(video, folder, tcp, by_hand):
+def test_processes_started_in_any_order_complete_a_run(video, folder, tcp, by_hand):
     """In the opposite order: in the usual one they are started below."""
     path, boxes = video
     order = "detector", "trainer", "compressor"
@@ -47,7 +47,7 @@ def test_processes_started_manually_in_any_order_complete_a_run(video, folder, t
     assert CheckpointStore(folder / CHECKPOINTS).load(Settings()).seq == len(boxes)
 
 
-def test_a_process_that_was_started_alone_names_the_missing_ones(video, folder, service):
+def test_process_started_alone_names_the_missing_ones(video, folder, service):
     detector = service("detector", "--set", f"run.endpoint={folder}", video[0], "--box", video[1][0])
     line = next(line for line in detector.stderr if "waiting" in line)
     assert line == f"detector: waiting at {folder} for services/compressor.py and services/trainer.py\n"
@@ -74,7 +74,7 @@ def test_no_process_outlives_its_program(video, number, until, alive):
     until(lambda: not any(map(alive, pids)))
 
 
-def test_processes_that_are_stopped_together_end_in_order_and_all_is_stored(video, endless, folder, by_hand, until):
+def test_processes_stopped_together_store_all_messages(video, endless, folder, by_hand, until):
     with Subscriber(TRACKS, Endpoint.parse(str(folder))) as tracks:
         processes = by_hand(endless, box=video[1][0])
         until(lambda: isinstance(track := tracks.receive(0.1), Track) and track.model_version)  # all have started
@@ -96,14 +96,14 @@ def failed(job, folder):
         supervisor.stop()
 
 
-def test_an_error_that_a_restart_cannot_resolve_is_reported_and_not_retried(folder, caplog):
+def test_error_that_a_restart_cannot_resolve_is_not_retried(folder, caplog):
     job = Job(str(folder / "gone.mp4"), {"": Box(1, 1, 9, 9)}, endpoint=str(folder))
     error, restarts = failed(job, folder)
     assert ("no video or folder" in error, restarts) == (True, 0)
     assert "detector died" not in caplog.text  # another process may hang on a busy machine
 
 
-def test_a_process_that_dies_repeatedly_ends_the_pipeline(video, folder, monkeypatch):
+def test_process_that_dies_repeatedly_ends_the_pipeline(video, folder, monkeypatch):
     start = Child.start
 
     def start_and_kill(child, after):
@@ -137,7 +137,7 @@ def test_hanging_processes_are_replaced_while_the_program_waits(video, until):
     assert [track.frame for track in tracks] == list(range(len(boxes)))
 
 
-def test_detector_started_by_hand_takes_boxes_and_models_and_ignores_empty_ones(monkeypatch):
+def test_detector_started_by_hand_ignores_empty_options(monkeypatch):
     jobs = []
     monkeypatch.setattr(scripts, "run", lambda _, job: jobs.append(job))
     words = ["detector.py", "walk.mp4", "--box=", "--box=anna=1,2,30,30", "--model=", "--model=ben=b.safetensors"]

@@ -11,7 +11,6 @@ from catstream.pipeline import Pipeline
 from catstream.processes.decisions import DesiredState
 from catstream.processes.state import DESIRED, files, position, restore
 from catstream.video.live_demo import first_box
-from tests.pipeline.conftest import share_found
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +28,7 @@ def state(finished, tmp_path):
     return shutil.copytree(finished, tmp_path / "here")
 
 
-def test_a_restored_state_is_at_the_same_position(state, tmp_path):
+def test_restored_state_is_at_the_same_position(state, tmp_path):
     assert files(tmp_path) == {}, "there is no checkpoint"
     content = files(state)
     restore(tmp_path / "there", content)
@@ -40,14 +39,14 @@ def test_a_restored_state_is_at_the_same_position(state, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["../other", "searched_models/../x", "/etc/passwd", "trees/1.safetensors.part"])
-def test_a_file_that_is_not_of_a_state_is_not_written(name, tmp_path):
+def test_file_that_is_not_of_a_state_is_not_written(name, tmp_path):
     with pytest.raises(ServiceError, match="not a file of the state"):
         restore(tmp_path, {name: b""})
     assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize(("changed", "held"), [({"paused": True}, "paused"), ({"objects": {}}, "waiting")])
-def test_a_run_that_was_paused_or_has_no_object_says_so_when_it_is_resumed(video, tmp_path, until, changed, held):
+def test_resumed_run_stays_paused_or_waits_for_a_box(video, tmp_path, until, changed, held):
     path, truth = video
     with Pipeline(path, truth[0], {"run.unstored_frames": 4}, state=tmp_path) as pipeline:
         next(iter(pipeline))  # and not to its end
@@ -58,7 +57,7 @@ def test_a_run_that_was_paused_or_has_no_object_says_so_when_it_is_resumed(video
 
 
 @pytest.mark.parametrize("changed", [{"paused": True}, {"objects": {}}])
-def test_a_run_at_its_end_ends_when_it_is_resumed_as_no_frame_is_left(state, changed):
+def test_resumed_run_without_frames_ends(state, changed):
     replace(DesiredState.load(state / DESIRED), **changed).save(state / DESIRED)
     with Pipeline(resume=state) as pipeline:
         assert list(pipeline) == []
@@ -66,7 +65,7 @@ def test_a_run_at_its_end_ends_when_it_is_resumed_as_no_frame_is_left(state, cha
 
 
 @pytest.mark.parametrize("lockstep", [False, True])
-def test_a_run_continues_after_the_last_frame_that_the_program_has_whole(video, tmp_path, until, lockstep):
+def test_resumed_run_continues_after_the_last_whole_frame(video, tmp_path, until, lockstep):
     path, truth = video
     boxes, settings = {"anna": truth[0], "ben": truth[0]}, {"run.lockstep": lockstep}
     with Pipeline(path, boxes, settings, state=tmp_path / "state") as pipeline:
@@ -76,16 +75,17 @@ def test_a_run_continues_after_the_last_frame_that_the_program_has_whole(video, 
         after = list(pipeline)
     missing = [(frame, name) for frame in range(8, len(truth)) for name in boxes]
     assert [(track.frame, track.object) for track in after] == missing
-    assert share_found(after, [truth[track.frame] for track in after]) > 0.8
+    found = [track.box is not None and track.box.overlap(truth[track.frame]) > 0.5 for track in after]
+    assert sum(found) > 0.8 * len(found)
     assert pipeline.totals["stored"] == pipeline.totals["sent"] == len(truth)
 
 
-def test_a_model_that_could_not_be_saved_is_an_error_before_the_run(video, tmp_path):
+def test_model_without_a_folder_is_an_error_before_the_run(video, tmp_path):
     with pytest.raises(ServiceError, match=r"none/anna \(No such file or directory\): pass a file in"):
         Pipeline(video[0], video[1][0], save_model=tmp_path / "none" / "anna")
 
 
-def test_a_live_run_continues_its_frames_and_times_after_a_power_cut(tmp_path):
+def test_resumed_live_run_continues_its_frames_and_times(tmp_path):
     """The log is ahead of the newest checkpoint on disk, by up to a minute."""
     state, settings = tmp_path / "state", {"run.checkpoint_seconds": 0.1}
     with Pipeline("demo:1", first_box("demo:1"), settings, state=state) as pipeline:
