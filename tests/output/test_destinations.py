@@ -24,7 +24,7 @@ from catstream.output.destinations import SinkOptions, check_sink
         ("ftp://me:secret@host/one", "is not a destination"),
     ],
 )
-def test_an_invalid_address_is_an_error_before_the_run_that_tells_no_password(place, words):
+def test_invalid_address_is_an_error_without_its_password(place, words):
     with pytest.raises(VideoError, match=words) as error:
         check_sink(place, SinkOptions())
     assert "secret" not in str(error.value)

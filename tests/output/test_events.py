@@ -23,14 +23,13 @@ def tracks(history, name="", began=0, first=0):
 LOST = ["0 found", "0 entered door", "3 left door", "3 lost"]
 
 
-def told(events):
+def texts(events):
     return [f"{event.track.time:g} {event.kind} {event.zone}".strip() for event in events]
 
 
 @pytest.mark.parametrize(
     ("history", "expected"),
     [
-        ("", []),
         ("...", ["2 ended"]),
         ("..1", ["2 found", "2 ended"]),
         ("1..1", ["0 found", "3 ended"]),  # shorter than three seconds
@@ -44,17 +43,33 @@ def told(events):
         ("5...1", [*LOST, "4 returned", "4 ended"]),
     ],
 )
-def test_a_history_of_an_object(history, expected):
+def test_history_of_an_object_gives_its_events(history, expected):
     events = Events(DOOR, WHEN | {"lost": 3.0})
-    assert told([*events.update([*tracks(history)]), *events.close()]) == expected
+    assert texts([*events.update([*tracks(history)]), *events.close()]) == expected
 
 
-def test_only_the_events_that_are_wanted_are_told():
+def test_only_the_selected_events_are_returned():
     events = Events(DOOR, {"lost": 1.0, "entered": 0.0})
-    assert told([*events.update([*tracks("5.1")]), *events.close()]) == ["0 entered door", "1 lost"]
+    assert texts([*events.update([*tracks("5.1")]), *events.close()]) == ["0 entered door", "1 lost"]
 
 
-def test_a_source_is_lost_after_the_seconds_of_lost_and_objects_are_unknown_until_their_next_track():
+@given(st.text(".0123456789", max_size=60))
+def test_events_of_any_history_are_in_pairs_and_agree_with_the_status(history):
+    events, found, inside = Events(DOOR), [], set()
+    for track in tracks(history):
+        for event in events.update([track]):
+            found.append(event.kind)
+            {"entered": inside.add, "left": inside.discard}.get(event.kind, lambda _: None)(event.zone)
+        status = events.status("")
+        assert set(status["zones"]) == inside
+        assert status["present"] or not inside
+    found += [event.kind for event in events.close()]
+    assert found.count("entered") == found.count("left")
+    assert found.count("lost") - found.count("returned") in (0, 1)
+    assert found[found.index("ended") :] == ["ended"] if history else not found
+
+
+def test_objects_of_a_lost_source_are_unknown_until_their_next_track():
     events = Events(DOOR, WHEN | {"lost": 3.0})
     events.update([*tracks("5")])
     seconds = (0.0, 1.0, 3.0, 9.0, 0.0, 2.0, 0.0)
@@ -63,21 +78,16 @@ def test_a_source_is_lost_after_the_seconds_of_lost_and_objects_are_unknown_unti
         [], [], [("source_lost", 3.0)], [], [("source_back", 9.0)], [], [],
     ]  # fmt: skip
     assert events.status("") == {"present": None, "zones": []}
-    assert told(events.update([*tracks("5", first=1)])) == []
+    assert texts(events.update([*tracks("5", first=1)])) == []
     assert events.status("") == {"present": True, "zones": ["door"]}
 
 
-def test_results_and_checkpoints_that_cannot_be_written_are_an_event_each_and_so_is_their_end():
+def test_failed_writes_and_their_recovery_are_events():
     events = Events({})
-    reports = [
-        *(
-            Health("detector", 0, {"write_failed": failed, "not_written": 7.0}, "full", "cam")
-            for failed in (0, 1, 1, 0)
-        ),
-        Health("compressor", 0, {"write_failed": 1}, "read-only"),
-        Health("compressor", 0, {}),  # restarted: it has not tried it yet
-        *(Health("compressor", 0, {"write_failed": failed}, "read-only" * failed) for failed in (1, 0, 0)),
-    ]
+    detector = [{"write_failed": failed, "not_written": 7.0} for failed in (0, 1, 1, 0)]
+    compressor = [{"write_failed": 1}, {}, *({"write_failed": failed} for failed in (1, 0, 0))]  # {}: restarted
+    reports = [Health("detector", 0, counters, "full", "cam") for counters in detector]
+    reports += [Health("compressor", 0, each, "read-only" * each.get("write_failed", 0)) for each in compressor]
     found = [event for report in reports for event in events.update_run(report)]
     assert [(event.kind, *event.facts.values()) for event in found] == [
         ("write_failed", "cam", 7, "full"),
@@ -87,55 +97,31 @@ def test_results_and_checkpoints_that_cannot_be_written_are_an_event_each_and_so
     ]
 
 
-def test_another_object_of_the_same_name_ends_the_one_before():
+def test_new_object_of_the_same_name_ends_the_earlier_one():
     events = Events(DOOR)
-    assert told(events.update([*tracks("5"), *tracks("1", began=1, first=1)])) == [
+    assert texts(events.update([*tracks("5"), *tracks("1", began=1, first=1)])) == [
         "0 found", "0 entered door", "0 left door", "0 ended", "1 found",
     ]  # fmt: skip
 
 
 @pytest.mark.parametrize("together", [True, False])
-def test_an_object_that_was_forgotten_ends_once_the_others_have_four_frames_more(together):
-    events = Events({})
-    ben = [[track] for track in tracks("1111", "ben")]
-    anna = [[track] for track in tracks("11111111", "anna")]
-    frames = [each + more for each, more in zip(anna, ben + [[]] * 4, strict=True)]
-    found = [
-        told(events.update(each)) for frame in frames for each in ([frame] if together else [[it] for it in frame])
-    ]
-    assert [each for each in found if each][-1] == ["3 ended"]
+def test_forgotten_object_ends_once_the_others_have_four_frames_more(together):
+    events, anna, ben = Events({}), [*tracks("11111111", "anna")], [*tracks("1111", "ben")]
+    frames = [[one, other] for one, other in zip(anna, ben, strict=False)] + [[one] for one in anna[4:]]
+    if not together:
+        frames = [[track] for frame in frames for track in frame]
+    found = [texts(events.update(frame)) for frame in frames]
     assert found[-1] == ["3 ended"]
-    assert told(events.close()) == ["7 ended"]
+    assert texts(events.close()) == ["7 ended"]
 
 
-def test_an_object_of_which_a_subscriber_loses_messages_has_not_ended():
+def test_lost_messages_of_an_object_do_not_end_it():
     """From the rest of one frame up to the beginning of a later one."""
     names = ("anna", "ben", "carl")
     frames = [*zip(*(tracks("1111111", name) for name in names), strict=True)]
     came = [*frames[0], frames[1][0], frames[4][2], *frames[5], *frames[6]]
     events = Events({})
     assert [event.kind for track in came for event in events.update([track])] == ["found"] * 3
-
-
-@given(st.text(".0123456789", max_size=60))
-def test_whatever_begins_ends(history):
-    events = Events(DOOR)
-    kinds = [event.kind for event in (*events.update([*tracks(history)]), *events.close())]
-    assert kinds.count("entered") == kinds.count("left")
-    assert kinds.count("ended") == bool(history)
-    assert kinds.count("lost") - kinds.count("returned") in (0, 1)
-    assert kinds[-1:] == ["ended"] * bool(history)
-
-
-@given(st.text(".0123456789", max_size=60))
-def test_an_object_is_in_the_zones_that_it_entered_and_in_none_while_it_is_lost(history):
-    events, inside = Events(DOOR), set()
-    for track in tracks(history):
-        for event in events.update([track]):
-            {"entered": inside.add, "left": inside.discard}.get(event.kind, lambda _: None)(event.zone)
-        status = events.status("")
-        assert set(status["zones"]) == inside
-        assert status["present"] or not inside
 
 
 FRAME = (320, 240)
@@ -155,14 +141,14 @@ FRAME = (320, 240)
         ("1,2 3,4 5,nan", "finite"),
     ],
 )
-def test_a_zone_that_nothing_can_enter_is_an_error(corners, words):
+def test_zone_that_nothing_can_enter_is_an_error(corners, words):
     points = tuple(tuple(map(float, corner.split(","))) for corner in corners.split())
     with pytest.raises(SettingsError, match=f"zone door: .*{words}"):
         check_zones({"door": points}, FRAME)
 
 
 @pytest.mark.parametrize("name", ["it's", "", "a b", "a/b", "a#", "{{x}}"])
-def test_a_zone_whose_name_is_not_safe_in_a_template_a_topic_or_a_file_name_is_an_error(name):
+def test_zone_with_an_unsafe_name_is_an_error(name):
     with pytest.raises(SettingsError, match=r"^zone: .* is not a name: expected text of 1 to 64 letters, digits"):
         check_zones({name: ((0, 0), (90, 0), (90, 90))})
 
@@ -178,5 +164,5 @@ def test_a_zone_whose_name_is_not_safe_in_a_template_a_topic_or_a_file_name_is_a
         "5,5 7,5 7,7",
     ],
 )
-def test_a_zone_that_is_partly_in_the_frame_is_valid(corners):
+def test_zone_partly_in_the_frame_is_valid(corners):
     check_zones({"door": tuple(tuple(map(float, corner.split(","))) for corner in corners.split())}, FRAME)

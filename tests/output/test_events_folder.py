@@ -51,7 +51,7 @@ def kinds(folder):
     return [file.stem.split("-", 1)[1] for file in sorted(folder.glob("2*.jpg"))]
 
 
-def test_each_event_has_a_picture_of_its_frame_or_a_later_one(tmp_path, endpoint, until, image):
+def test_event_has_a_picture_of_its_frame_or_a_later_one(tmp_path, endpoint, until, image):
     with writing(tmp_path / "new", endpoint, until, when={"found": 0.0, "lost": 2.0}) as (sink, previews):
         sink.write(frame(0))
         previews.send(Preview(0, 0.0, 640, 480, {"anna": BOX}, image))
@@ -66,7 +66,7 @@ def test_each_event_has_a_picture_of_its_frame_or_a_later_one(tmp_path, endpoint
     assert len(np.unique(found[12:16, 12:58].reshape(-1, 3), axis=0)) < 46 * 4, "and the box"
 
 
-def test_the_oldest_pictures_are_removed_and_other_files_stay(tmp_path, endpoint, until, image):
+def test_oldest_pictures_are_removed_and_other_files_stay(tmp_path, endpoint, until, image):
     (tmp_path / "20200101T000000.000Z-found-ben.jpg").write_bytes(image)
     (tmp_path / "holiday.jpg").write_bytes(image)
     chosen = {"when": {"found": 0.0, "lost": 2.0, "returned": 0.0}, "megabytes": 4 * len(image) / 1e6}
@@ -80,13 +80,13 @@ def test_the_oldest_pictures_are_removed_and_other_files_stay(tmp_path, endpoint
     assert sum(file.stat().st_size for file in tmp_path.glob("2*.jpg")) <= 4 * len(image)
 
 
-def test_a_folder_that_cannot_be_made_is_an_error_before_the_run(tmp_path):
+def test_folder_that_cannot_be_made_is_an_error_before_the_run(tmp_path):
     (tmp_path / "file").touch()
     with pytest.raises(VideoError, match=r"cannot make the folder .*: Not a directory"):
         check_sink(f"{tmp_path}/file/events/", SinkOptions())
 
 
-def test_each_event_is_a_line_of_json_which_names_its_picture(tmp_path, endpoint, until, image, monkeypatch):
+def test_event_is_a_line_of_json_which_names_its_picture(tmp_path, endpoint, until, image, monkeypatch):
     monkeypatch.setattr(events_folder, "_LOG_BYTES", 1)
     with writing(tmp_path, endpoint, until) as (sink, previews):
         previews.send(Preview(0, 0.0, 640, 480, {}, image))

@@ -49,10 +49,12 @@ def made(path, name=None, log=LOG, **about):
 
 def test_mot_counts_from_one_and_has_no_line_for_an_absent_object(tmp_path):
     box = "11.00,21.00,30.50,40.00,0.7500,-1,-1,-1"
-    assert made(tmp_path / "t.txt").read_text().splitlines() == [f"1,1,{box}", f"1,2,{box}", f"4,3,{box}", f"4,2,{box}"]
+    log = [*LOG, TrackedFrame([present(4, "anna", began=4)])]  # another object of the same name
+    lines = made(tmp_path / "t.txt", log=log).read_text().splitlines()
+    assert lines == [f"{numbers},{box}" for numbers in ("1,1", "1,2", "4,3", "4,2", "5,4")]
 
 
-def test_coco_has_tracks_and_cuts_boxes_at_the_edges_of_the_frame(tmp_path):
+def test_coco_has_tracks_and_cuts_boxes_at_the_edges(tmp_path):
     coco = COCO(made(tmp_path / "t.json", log=ANNOTATED, size=(100, 80)))
     assert [(each["id"], each["file_name"], each["width"]) for each in coco.loadImgs(coco.getImgIds())] == [
         (number + 1, f"walk_{number:06d}.jpg", 100) for number in range(4)
@@ -64,18 +66,15 @@ def test_coco_has_tracks_and_cuts_boxes_at_the_edges_of_the_frame(tmp_path):
     ]  # fmt: skip
     assert [each["attributes"]["doubtful"] for each in boxes] == [False, False, True, False, False]
     assert (boxes[1]["area"], boxes[1]["score"], boxes[1]["iscrowd"]) == (800.0, 0.75, 0)
-    (video,) = coco.dataset["videos"]
-    assert {each["video_id"] for name in ("images", "tracks", "annotations") for each in coco.dataset[name]} == {1}
-    assert (video["id"], [each["id"] for each in coco.dataset["tracks"]]) == (1, [1, 2, 3])
+    lists = ("images", "tracks", "annotations")
+    assert {each["video_id"] for name in lists for each in coco.dataset[name]} == {coco.dataset["videos"][0]["id"]}
+    assert [each["id"] for each in coco.dataset["tracks"]] == [1, 2, 3]
 
 
-def test_cvat_has_a_keyframe_for_each_box_and_an_outside_one_after_the_last(tmp_path):
+def test_cvat_has_a_keyframe_for_each_box_and_ends_tracks_outside(tmp_path):
     root = ElementTree.parse(made(tmp_path / "t.xml", log=ANNOTATED, size=(100, 80))).getroot()
-    assert (root.tag, root.findtext("version"), root.findtext("meta/task/mode")) == (
-        "annotations",
-        "1.1",
-        "interpolation",
-    )
+    assert (root.tag, root.findtext("version")) == ("annotations", "1.1")
+    assert root.findtext("meta/task/mode") == "interpolation"
     assert [label.text for label in root.iterfind("meta/task/labels/label/name")] == ["object", "anna"]
     found = {
         (track.get("id"), track.get("label")): [
@@ -94,7 +93,7 @@ def test_cvat_has_a_keyframe_for_each_box_and_an_outside_one_after_the_last(tmp_
     assert (box.get("keyframe"), box.get("occluded"), box.get("z_order")) == ("1", "0", "0")
 
 
-def test_cvat_has_the_checks_of_an_annotation_as_an_attribute_of_every_keyframe(tmp_path):
+def test_cvat_keyframes_have_the_checks_of_an_annotation(tmp_path):
     checks = ("keyframe", "hidden", "checked", "unchecked")
     log = [TrackedFrame([present(frame, "anna", checked=check)]) for frame, check in enumerate(checks)]
     root = ElementTree.parse(made(tmp_path / "t.xml", log=log, size=(100, 80))).getroot()
@@ -104,7 +103,7 @@ def test_cvat_has_the_checks_of_an_annotation_as_an_attribute_of_every_keyframe(
     assert {*values.split()} == {*checks}
 
 
-def test_yolo_has_a_file_for_each_frame_with_centres_in_parts_of_it(tmp_path):
+def test_yolo_has_a_file_of_relative_boxes_for_each_frame(tmp_path):
     folder = made(tmp_path / "set", "yolo", [*ANNOTATED[:2], TrackedFrame([present(2, "", None)])], size=(100, 80))
     object_line, half = "0 0.252500 0.500000 0.305000 0.500000\n", "1 0.100000 0.500000 0.200000 0.500000\n"
     assert {file.name: file.read_text() for file in (folder / "labels").iterdir()} == {
@@ -130,7 +129,7 @@ def test_via_has_a_row_for_each_box_as_movement_reads_it(tmp_path):
 
 
 @pytest.mark.parametrize(("name", "kind"), [("t.json", None), ("t.xml", None), ("folder", "yolo")])
-def test_a_format_that_needs_the_size_of_a_frame_asks_for_it(tmp_path, name, kind):
+def test_format_with_the_frame_size_requires_the_source(tmp_path, name, kind):
     with pytest.raises(VideoError, match="pass the video or folder"):
         made(tmp_path / name, kind)
     assert not [*tmp_path.iterdir()]
@@ -138,7 +137,7 @@ def test_a_format_that_needs_the_size_of_a_frame_asks_for_it(tmp_path, name, kin
 
 @pytest.mark.parametrize("disk", [1 << 16], indirect=True)
 @pytest.mark.parametrize("suffix", [".txt", ".sqlite", ".json", ".xml", ".via.csv"])
-def test_a_full_disk_is_an_error_and_leaves_the_earlier_file_as_it_is(disk, suffix):
+def test_full_disk_leaves_the_earlier_file_as_it_is(disk, suffix):
     (disk / f"t{suffix}").write_text("dear to somebody")
     (disk / "ballast").write_bytes(bytes((1 << 16) - 4096))
     with pytest.raises(VideoError, match="cannot write"):
@@ -147,13 +146,13 @@ def test_a_full_disk_is_an_error_and_leaves_the_earlier_file_as_it_is(disk, suff
     assert (disk / f"t{suffix}").read_text() == "dear to somebody"
 
 
-@pytest.mark.parametrize("name", ["t.xls", "folder"])
-def test_a_name_that_does_not_say_the_format_needs_the_option(tmp_path, name):
-    with pytest.raises(VideoError, match="pass --format, one of mot, csv"):
-        export_of(tmp_path / name, None)
+def test_unknown_suffix_requires_the_option_format(tmp_path):
+    for name in ("t.xls", "folder"):
+        with pytest.raises(VideoError, match="pass --format, one of mot, csv"):
+            export_of(tmp_path / name, None)
 
 
-def test_every_format_has_the_numbers_of_the_frames_in_the_source(tmp_path):
+def test_every_format_has_the_frame_numbers_of_the_source(tmp_path):
     log = [TrackedFrame([present(frame, "", source_frame=20 + 5 * frame)]) for frame in range(3)]
     about = {"log": log, "size": (100, 80), "header": Header(start=20, stride=5), "frames": 40}
     files = {suffix: made(tmp_path / f"t{suffix}", **about) for suffix in (".txt", ".json", ".xml", ".via.csv")}
@@ -173,38 +172,25 @@ def test_every_format_has_the_numbers_of_the_frames_in_the_source(tmp_path):
 @pytest.mark.parametrize(
     ("frames", "keys"), [(9, [(0, "0"), (1, "1"), (3, "0"), (4, "1")]), (4, [(0, "0"), (1, "1"), (3, "0")])]
 )
-def test_cvat_ends_a_track_after_its_last_box_unless_the_video_ends_there(tmp_path, frames, keys):
+def test_cvat_ends_a_track_unless_the_video_ends_there(tmp_path, frames, keys):
     log = [TrackedFrame([present(0, "")]), TrackedFrame([present(3, "")])]
     root = ElementTree.parse(made(tmp_path / "t.xml", log=log, size=(100, 80), frames=frames))
     assert [(int(box.get("frame")), box.get("outside")) for box in root.iter("box")] == keys
 
 
-def test_objects_that_were_given_one_name_are_tracks_of_their_own(tmp_path):
-    log = [TrackedFrame([present(0, "anna")]), TrackedFrame([present(1, "anna", began=1)])]
-    mot = [line.split(",")[:2] for line in made(tmp_path / "t.txt", log=log).read_text().splitlines()]
-    tracks = [
-        track["id"] for track in json.loads(made(tmp_path / "t.json", log=log, size=(9, 9)).read_text())["tracks"]
-    ]
-    cvat = [*ElementTree.parse(made(tmp_path / "t.xml", log=log, size=(99, 99))).iter("track")]
-    assert mot == [["1", "1"], ["2", "2"]]
-    assert tracks == []  # none of the boxes is in such a frame
-    assert [track.get("label") for track in cvat] == ["anna", "anna"]
-
-
-@pytest.mark.parametrize(("classes", "numbers"), [((), [0, 1]), (("ben", "anna"), [1, 0])])
-def test_classes_have_numbers_also_of_an_object_that_is_never_present(tmp_path, classes, numbers):
+@pytest.mark.parametrize(("classes", "names"), [((), ["anna", "ben"]), (("ben", "anna"), ["ben", "anna"])])
+def test_classes_are_numbered_even_if_never_present(tmp_path, classes, names):
     log = [TrackedFrame([present(0, "anna", None), present(0, "ben", None)])]
     about = {"log": log, "size": (100, 80), "classes": classes}
     coco = json.loads(made(tmp_path / "t.json", **about).read_text())["categories"]
     labels = ElementTree.parse(made(tmp_path / "t.xml", **about)).iterfind("meta/task/labels/label/name")
-    names = dict(zip(numbers, ("anna", "ben"), strict=True))
-    lines = "".join(f'\n  {number}: "{names[number]}"' for number in (0, 1))
-    assert (made(tmp_path / "set", "yolo", **about) / "data.yaml").read_text().endswith(f"names:{lines}\n")
-    assert {entry["id"] - 1: entry["name"] for entry in coco} == names
-    assert [label.text for label in labels] == [names[0], names[1]]
+    yaml = (made(tmp_path / "set", "yolo", **about) / "data.yaml").read_text()
+    assert yaml.endswith('names:\n  0: "{}"\n  1: "{}"\n'.format(*names))
+    assert [(entry["id"], entry["name"]) for entry in coco] == [*enumerate(names, 1)]
+    assert [label.text for label in labels] == names
 
 
-def test_a_class_that_is_missing_is_an_error_before_anything_is_written(tmp_path):
+def test_missing_class_is_an_error_before_the_first_file(tmp_path):
     folder = made(tmp_path / "set", "yolo", LOG, size=(100, 80))
     before = {file: file.read_bytes() for file in folder.rglob("*.*")}
     with pytest.raises(VideoError, match="--classes lacks 'object'"):
@@ -212,7 +198,7 @@ def test_a_class_that_is_missing_is_an_error_before_anything_is_written(tmp_path
     assert {file: file.read_bytes() for file in folder.rglob("*.*")} == before
 
 
-def test_labels_have_the_names_of_the_images_of_a_folder(tmp_path):
+def test_labels_have_the_names_of_the_images(tmp_path):
     images = [tmp_path / f"shot_{number}.png" for number in (9, 10, 11)]
     for number, image in enumerate(images):
         image.write_bytes(b"%d" % number)
@@ -222,7 +208,7 @@ def test_labels_have_the_names_of_the_images_of_a_folder(tmp_path):
     assert [(file.name, file.read_bytes()) for file in (folder / "images").iterdir()] == [("shot_10.png", b"1")]
 
 
-def test_a_csv_file_is_made_from_other_logs(tmp_path):
+def test_csv_is_made_from_other_logs(tmp_path):
     log = [TrackedFrame([present(frame, "anna"), present(frame, "", None)], 0.5) for frame in range(2)]
     read = Log(made(tmp_path / "t.csv", log=log))
     assert [track.box for frame in read for track in frame.tracks] == [BOX, None] * 2
