@@ -12,16 +12,19 @@ FRAMES, SIZE = 24, (320, 240)
 pytestmark = pytest.mark.system
 
 
-def test_a_video_is_annotated_by_mouse_and_keys(script_of_browser, catstream, demo_video, tmp_path):
+def run_script(words):
+    """Run a script with a browser, and return the lines that it prints."""
+    run = subprocess.run(words, capture_output=True, text=True, check=False)
+    assert run.returncode == 0, run.stdout + run.stderr
+    return run.stdout.splitlines()
+
+
+def test_video_is_annotated_by_mouse_and_keys(script_of_browser, catstream, demo_video, tmp_path):
     video, truth = demo_video(FRAMES)
     out = tmp_path / "out"
     process = catstream("annotate", video, "--output", out, "--listen", "0", env=os.environ | {"PYTHONUNBUFFERED": "1"})
     link, boxes = process.stdout.readline().strip(), json.dumps([truth[0], truth[-1]])
-    run = subprocess.run(
-        script_of_browser("annotate.mjs", link, boxes, *map(str, SIZE)), capture_output=True, text=True, check=False
-    )
-    assert run.returncode == 0, run.stdout + run.stderr
-    lines = run.stdout.splitlines()
+    lines = run_script(script_of_browser("annotate.mjs", link, boxes, *map(str, SIZE)))
     assert lines[0].startswith("refused 'no name' is not a name: expected")
     assert "proposals 1 forwards,2 backwards,anna" in lines
     assert {"objects anna,ben", "changed [1,10,8,0]"} <= {*lines}
@@ -36,7 +39,7 @@ def test_a_video_is_annotated_by_mouse_and_keys(script_of_browser, catstream, de
     assert (out / "demo.csv").read_text().count(",carl,") == FRAMES
 
 
-def test_several_videos_are_annotated_one_after_the_other(script_of_browser, catstream, said, demo_video, tmp_path):
+def test_several_videos_are_annotated_one_after_the_other(script_of_browser, catstream, succeed, demo_video, tmp_path):
     video, truth = demo_video(FRAMES)
     (tmp_path / "monday").mkdir()
     for name in ("monday/walk.mp4", "monday/run10.mp4", "monday/run9.mp4", "walk.mp4"):
@@ -46,14 +49,7 @@ def test_several_videos_are_annotated_one_after_the_other(script_of_browser, cat
     words = ["annotate", tmp_path / "monday", tmp_path / "walk.mp4", "--output", out, "--listen", "0"]
     process = catstream(*words, env=os.environ | {"PYTHONUNBUFFERED": "1"})
     link = process.stdout.readline().strip()
-    run = subprocess.run(
-        script_of_browser("videos.mjs", link, *map(str, SIZE), json.dumps(truth[0])),
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert run.returncode == 0, run.stdout + run.stderr
-    assert run.stdout.splitlines() == [
+    assert run_script(script_of_browser("videos.mjs", link, *map(str, SIZE), json.dumps(truth[0]))) == [
         "first run9, 1 of 4",
         f"videos run9,run10,monday_walk,{tmp_path.name}_walk 1",
         "errors []",
@@ -64,6 +60,5 @@ def test_several_videos_are_annotated_one_after_the_other(script_of_browser, cat
     logs = {log.parent.name: log.read_text() for log in out.glob("*/*.csv") if log.stem.startswith("run")}
     assert logs["run9-annotation"].count(",anna,") == logs["run10-annotation"].count(",ben,") == FRAMES
 
-    code, *_ = said("batch", out / "run9-annotation" / "keyframes.csv", "--output", tmp_path / "again", "--jobs", 1)
-    assert code == 0
+    succeed("batch", out / "run9-annotation" / "keyframes.csv", "--output", tmp_path / "again", "--jobs", 1)
     assert (tmp_path / "again" / "monday_run9.csv").read_text().count(",anna,") == FRAMES

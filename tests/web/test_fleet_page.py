@@ -12,7 +12,7 @@ pytestmark = pytest.mark.system
 TOKEN = "correct-horse-battery"
 
 
-def test_a_stream_can_be_opened_and_the_last_state_stays_if_the_fleet_is_silent(
+def test_stream_is_opened_and_a_silent_fleet_keeps_its_last_state(
     fleet, manager, serve_fleet, camera, turning, folder, script_of_browser, monkeypatch
 ):
     monkeypatch.setattr(wall, "REGISTRY_SECONDS", 1.0)
@@ -25,21 +25,21 @@ def test_a_stream_can_be_opened_and_the_last_state_stays_if_the_fleet_is_silent(
     fleet.stream("cam-9", "failed", trouble="cam-9 needs a node with site=west, there is none")
     fleet.stream("dock", "waiting", node="south-2")
     link = str(serve_fleet(token=TOKEN).base_url.copy_set_param("token", TOKEN))
-    said = {}
+    printed = {}
     words = script_of_browser("fleet.mjs", link)
     with turning(camera, 0.02), subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as browser:
         for line in browser.stdout:
             name, *values = json.loads(line)
-            said.setdefault(name, []).extend(values)
+            printed.setdefault(name, []).extend(values)
             if name == "silence":
                 manager.close()
-    assert said["all"] == [["cam-9", "cam-7", "cam-10", "dock"]]
-    assert said["wall"] == [["anna present", "ben absent"]]
-    assert said["picture"] == [True]
-    assert [[text.split("\n")[0] for text in texts] for texts in said["nodes"]] == [["south", "north", "south-2"]]
-    assert said["page"] == [["/streams/cam-7/", "cam-7 – catstream"]]
-    assert said["back"] == said["fleet"] == said["all"]
-    assert said["silent"][0].startswith("The fleet does not answer. This page shows the state of ")
-    assert [each for each in said["violations"] if each] == [], "found by axe"
-    assert set(said["too wide"]) == {0}
-    assert said["errors"] == [[]]
+    assert printed["all"] == [["cam-9", "cam-7", "cam-10", "dock"]]
+    assert printed["wall"] == [["anna present", "ben absent"]]
+    assert printed["picture"] == [True]
+    assert [[text.split("\n")[0] for text in texts] for texts in printed["nodes"]] == [["south", "north", "south-2"]]
+    assert printed["page"] == [["/streams/cam-7/", "cam-7 – catstream"]]
+    assert printed["back"] == printed["fleet"] == printed["all"]
+    assert printed["silent"][0].startswith("The fleet does not answer. This page shows the state of ")
+    assert [each for each in printed["violations"] if each] == [], "found by axe"
+    assert set(printed["too wide"]) == {0}
+    assert printed["errors"] == [[]]

@@ -23,9 +23,7 @@ SIZE = (320, 240)
 LEAVES = 475  # frame of the demo in which the object has left the picture
 
 
-def test_objects_are_drawn_forgotten_and_tracked_until_they_leave_after_a_restart(
-    script_of_browser, folder, tmp_path, until
-):
+def test_objects_are_drawn_forgotten_and_tracked_after_a_restart(script_of_browser, folder, tmp_path, until):
     path, boxes = tmp_path / "demo.mp4", []
     with VideoWriter(path, RATE, SIZE) as video:
         for image, box in map(Demo(SIZE).image, range(LEAVES - 120, LEAVES + 25)):
@@ -38,9 +36,9 @@ def test_objects_are_drawn_forgotten_and_tracked_until_they_leave_after_a_restar
     words = script_of_browser("page.mjs", server.url, ",".join(map(str, boxes[0])), str(SIZE[0]))
     output = tmp_path / "output"
 
-    def said(line):
-        ended, lines = browser.poll() is not None, output.read_text().splitlines()
-        assert line in lines or not ended, lines
+    def printed(line):
+        has_ended, lines = browser.poll() is not None, output.read_text().splitlines()
+        assert line in lines or not has_ended, lines
         return line in lines
 
     with (
@@ -54,19 +52,19 @@ def test_objects_are_drawn_forgotten_and_tracked_until_they_leave_after_a_restar
                 if not track.object and track.state in waits:
                     waits[track.state] -= 1
                     if not waits[track.state]:
-                        seen = {"present": "paused", "absent": "state absent"}[track.state]
-                        until(lambda seen=seen: said(seen))
+                        line = {"present": "paused", "absent": "state absent"}[track.state]
+                        until(lambda line=line: printed(line))
                         del waits[track.state]
                 if not waits:
                     break
-            until(lambda: said("trees"))
-        until(lambda: said("state ended"))
+            until(lambda: printed("trees"))
+        until(lambda: printed("state ended"))
         with Pipeline(str(path), boxes[0], settings) as pipeline:
             browser.stdin.write("restart\n")
             browser.stdin.flush()
             until(lambda: feed.dashboard.phase == "running")
             for _ in pipeline:
-                if said("errors []"):
+                if printed("errors []"):
                     break
                 sleep(0.5)  # the page shows the next frames
     lines = output.read_text().splitlines()
@@ -78,7 +76,7 @@ def test_objects_are_drawn_forgotten_and_tracked_until_they_leave_after_a_restar
     assert "overflow 0" in lines
 
 
-def test_object_of_a_camera_is_tracked_from_the_still_picture_of_its_box(script_of_browser, folder, walker):
+def test_object_of_a_camera_is_tracked_from_its_still_picture(script_of_browser, folder, walker):
     url, find = walker
     server = Server(Site(PipelineFeed(Address(str(folder)))), port=0, token=None)
     words = script_of_browser("live.mjs", server.url, "1")
@@ -89,8 +87,7 @@ def test_object_of_a_camera_is_tracked_from_the_still_picture_of_its_box(script_
         subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as browser,
     ):
         pool.submit(list, pipeline)  # until it is closed
-        said, time = browser.stdout.readline().split()
-        assert said == "picture"
+        _, time = browser.stdout.readline().split()
         box = find(httpx.get(f"{server.url}pictures/{time}.jpg").content)
         browser.stdin.write(",".join(map(str, box)) + "\n")
         browser.stdin.flush()
@@ -98,5 +95,5 @@ def test_object_of_a_camera_is_tracked_from_the_still_picture_of_its_box(script_
         assert " s before frame 0" in browser.stdout.readline()
         assert browser.stdout.readline() == "errors []\n"
         with subscribe(str(folder), "previews", timeout=500) as pictures:
-            shown = next(pictures)
-        assert shown.boxes[""].overlap(find(shown.jpeg)) > 0.5
+            picture = next(pictures)
+        assert picture.boxes[""].overlap(find(picture.jpeg)) > 0.5
