@@ -35,13 +35,6 @@ def spec(demo_video):
 
 
 @pytest.fixture
-def long_spec(demo_video):
-    """A stream that runs for seconds after the store fails."""
-    path, truth = demo_video(1000)
-    return StreamSpec("cam-7", str(path), {"": Box(*truth[0])}, settings={"run.lockstep": True})
-
-
-@pytest.fixture
 def recorded(monkeypatch):
     """The claims that write a state, and those that are checked, in two lists."""
     lists = [], []
@@ -65,7 +58,7 @@ def frames_of(path):
     return [json.loads(line)["frame"] for line in path.read_text().splitlines()[1:]]
 
 
-def test_a_stream_continues_its_log_however_it_ends(spec, store, until, tmp_path):
+def test_log_of_a_stream_is_continued_after_a_stop_and_a_torn_line(spec, store, until, tmp_path):
     log = tmp_path / "new" / "cam-7.ndjson"
     spec = replace(spec, write=(str(log), str(log.with_suffix(".csv"))))
     with started(spec, store) as first:
@@ -78,9 +71,9 @@ def test_a_stream_continues_its_log_however_it_ends(spec, store, until, tmp_path
     assert len(log.with_suffix(".csv").read_text().splitlines()) == FRAMES + 1
 
 
-def test_a_live_stream_uses_no_frame_number_of_its_log_again(store, until, tmp_path):
+def test_live_stream_repeats_no_frame_number_of_its_log(store, until, tmp_path):
     spec = StreamSpec("gate", LIVE, {"": first_box(LIVE)}, write=(str(tmp_path / "gate.ndjson"),))
-    with started(spec, store, every=0.2) as stream:
+    with started(spec, store) as stream:
         until(lambda: Store(store).stream("gate").newest() is not None)
         stream._every = 60.0  # what follows is not stored
         until(lambda: stream.report()[0].frame > 60)
@@ -93,7 +86,7 @@ def test_a_live_stream_uses_no_frame_number_of_its_log_again(store, until, tmp_p
     assert frames == sorted(set(frames))
 
 
-def test_a_stream_that_has_ended_runs_again_only_if_it_is_changed(spec, store, until):
+def test_ended_stream_runs_again_only_if_it_is_changed(spec, store, until):
     changed, reports = replace(spec, settings=spec.settings | {"coreset.size": 32}), []
     for each in (spec, spec, spec, changed):
         with started(each, store) as stream:
@@ -106,7 +99,7 @@ def test_a_stream_that_has_ended_runs_again_only_if_it_is_changed(spec, store, u
     assert reports[2].stored_seconds is not None
 
 
-def test_a_source_that_cannot_be_opened_is_named_and_tried_again(spec, store, until, tmp_path, monkeypatch):
+def test_source_that_cannot_be_opened_is_named_and_retried(spec, store, until, tmp_path, monkeypatch):
     monkeypatch.setattr(module, "FIRST_PAUSE_SECONDS", 0.1)
     path = tmp_path / "late.mp4"
     with started(replace(spec, source=str(path)), store, address="127.0.0.1") as stream:
@@ -118,7 +111,7 @@ def test_a_source_that_cannot_be_opened_is_named_and_tried_again(spec, store, un
     assert (status.token > 1, status.trouble, is_superseded) == (True, "", False)
 
 
-def test_a_paused_stream_uploads_nothing_and_notices_a_newer_claim(store, until, recorded):
+def test_paused_stream_uploads_nothing_and_notices_a_newer_claim(store, until, recorded):
     written, checked = recorded
 
     def uploads():
@@ -137,7 +130,7 @@ def test_a_paused_stream_uploads_nothing_and_notices_a_newer_claim(store, until,
         until(lambda: stream.report()[1])
 
 
-def test_a_state_waits_for_its_size_unless_the_stream_was_commanded_or_has_failed(store, until, monkeypatch, recorded):
+def test_upload_rate_is_limited_except_after_a_command_or_failure(store, until, monkeypatch, recorded):
     written, checked = recorded
     monkeypatch.setattr(module, "_CHECK_SECONDS", 0.1)
     monkeypatch.setattr(module, "_STORE_RATE", 1.0)  # bytes per second
@@ -157,7 +150,7 @@ def test_a_state_waits_for_its_size_unless_the_stream_was_commanded_or_has_faile
         assert Store(store).stream("gate").newest().facts["frame"] > last + 100
 
 
-def test_a_stream_that_has_lost_its_source_says_so(store, camera, demo_video, until):
+def test_lost_source_is_the_state_and_trouble_of_its_stream(store, camera, demo_video, until):
     path, boxes = demo_video(FRAMES)
     with open_source(path) as film:
         image = next(film).image
@@ -171,7 +164,7 @@ def test_a_stream_that_has_lost_its_source_says_so(store, camera, demo_video, un
     assert lost.present == {}, "where the object is, is not known"
 
 
-def test_a_live_stream_continues_on_another_node_with_what_it_has_learned(store, until):
+def test_live_stream_continues_on_another_node_with_its_models(store, until):
     spec = StreamSpec("gate", LIVE, {"": first_box(LIVE)})
 
     def stored_at():
@@ -191,7 +184,7 @@ def test_a_live_stream_continues_on_another_node_with_what_it_has_learned(store,
     assert status.stored_seconds is not None, "that of the state that it continued from"
 
 
-def test_no_two_streams_of_a_node_listen_on_the_same_ports(tcp, monkeypatch):
+def test_streams_of_a_node_listen_on_different_ports(tcp, monkeypatch):
     first = int(tcp.rpartition(":")[2])
     blocks = range(first, first + 9, 3)
     monkeypatch.setattr(discovery, "PORTS", blocks)
@@ -199,23 +192,23 @@ def test_no_two_streams_of_a_node_listen_on_the_same_ports(tcp, monkeypatch):
         assert sorted(free_ports("127.0.0.1", stack) for _ in blocks) == list(blocks)
 
 
-def test_a_stream_goes_on_while_the_store_takes_nothing(long_spec, store, until, monkeypatch):
-    def fails(*_):
+def test_stream_continues_while_its_state_cannot_be_stored(store, until, monkeypatch):
+    def fail(*_):
         raise StoreError("the store cannot be reached")
 
-    with started(long_spec, store) as stream:
+    with started(StreamSpec("gate", LIVE, {"": first_box(LIVE)}), store) as stream:
         until(lambda: stream.report()[0].frame >= 3)
         with monkeypatch.context() as patch:
-            patch.setattr(Claim, "write", fails)
+            patch.setattr(Claim, "write", fail)
             until(lambda: "cannot be stored: the store cannot be reached" in stream.report()[0].trouble)
             frame = stream.report()[0].frame
             until(lambda: stream.report()[0].frame > frame)
         until(lambda: stream.report()[0].trouble == "")
-        monkeypatch.setattr(Claim, "write", fails)
+        monkeypatch.setattr(Claim, "write", fail)
         assert stream.stop() == "its state cannot be stored: the store cannot be reached"
 
 
-def test_a_stream_has_ended_only_once_its_last_state_is_stored(spec, store, until, monkeypatch):
+def test_stream_has_ended_once_its_last_state_is_stored(spec, store, until, monkeypatch):
     written, write = [], Claim.write
 
     def fails_at_first(claim, files, facts):

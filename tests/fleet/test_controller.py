@@ -154,7 +154,7 @@ def states(site):
     return {name: each.state for name, each in site.status().streams.items()}
 
 
-def test_streams_are_detached_actors_that_ray_places_and_restarts(site, ray):
+def test_streams_are_detached_actors_placed_and_restarted_by_ray(site, ray):
     options = ray.of("roof").options
     assert options["num_cpus"] == 0.5
     assert (options["lifetime"], options["max_restarts"]) == ("detached", -1)
@@ -164,7 +164,7 @@ def test_streams_are_detached_actors_that_ray_places_and_restarts(site, ray):
     assert site.status().nodes["n1"].used == 1.0
 
 
-def test_a_controller_that_starts_again_touches_no_stream_that_runs(site, ray, made, spec):
+def test_restarted_controller_leaves_running_streams_alone(site, ray, made, spec):
     running(site, ray, "gate")
     actors = dict(ray.actors)
     ray.has_restarted = True
@@ -175,7 +175,7 @@ def test_a_controller_that_starts_again_touches_no_stream_that_runs(site, ray, m
     assert states(again) == {"gate": "running", "roof": "starting"}
 
 
-def test_a_controller_that_starts_again_keeps_the_keys_of_the_clients(ray, spec, tmp_path, tcp):
+def test_restarted_controller_accepts_the_keys_of_its_clients(ray, spec, tmp_path, tcp):
     for has_restarted in (False, True):
         ray.has_restarted = has_restarted
         site = Controller("site", spec.store, tcp, str(tmp_path / "keys"))
@@ -189,7 +189,7 @@ def test_a_controller_that_starts_again_keeps_the_keys_of_the_clients(ray, spec,
             site.end()
 
 
-def test_a_stream_that_has_ended_is_stopped_and_runs_again_only_if_it_is_changed(site, ray):
+def test_ended_stream_is_started_again_only_if_it_is_changed(site, ray):
     began = time.monotonic()
     running(site, ray, "gate", state="ended", frame=31, stored_seconds=2.0)
     for _ in range(3):
@@ -203,7 +203,7 @@ def test_a_stream_that_has_ended_is_stopped_and_runs_again_only_if_it_is_changed
     assert (states(site)["gate"], ray.started.count("gate")) == ("starting", 2)
 
 
-def test_one_that_another_process_has_claimed_is_killed_and_claims_again(site, ray):
+def test_superseded_actor_is_killed_and_replaced(site, ray):
     actor = ray.of("gate")
     actor.superseded = True
     running(site, ray, "gate", state="failed")
@@ -212,7 +212,7 @@ def test_one_that_another_process_has_claimed_is_killed_and_claims_again(site, r
     assert ray.of("gate") is not actor
 
 
-def test_of_a_stream_that_is_removed_and_forgotten_nothing_is_left(site, ray, spec):
+def test_removed_and_forgotten_stream_leaves_nothing(site, ray, spec):
     store = Store(spec.store)
     store.stream("gate").claim().write({"a": b""}, {"ended": False})
     with pytest.raises(FleetError, match=r"no stream named 'cam-8' in the fleet site \(streams: gate, roof\)"):
@@ -229,7 +229,7 @@ def test_of_a_stream_that_is_removed_and_forgotten_nothing_is_left(site, ray, sp
     assert ray.of("gate").options["scheduling_strategy"] == "SPREAD"
 
 
-def test_a_setting_with_which_a_stream_cannot_continue_is_not_changed(site, spec):
+def test_change_that_a_stream_cannot_continue_with_is_rejected(site, spec):
     assert "gate: starts again" in site.add(replace(GATE, settings={"run.lag_frames": 26}), {})[0]
     gate = replace(GATE, settings={"coreset.size": 32})
     changed = replace(spec, streams={"gate": gate, "roof": ROOF})
@@ -242,7 +242,7 @@ def test_a_setting_with_which_a_stream_cannot_continue_is_not_changed(site, spec
     site.apply(changed, {})
 
 
-def test_a_change_that_cannot_be_stored_is_refused_and_not_done(site, monkeypatch):
+def test_change_that_cannot_be_stored_is_rejected(site, monkeypatch):
     def fails(*_):
         raise StoreError("the store cannot be reached")
 
@@ -254,7 +254,7 @@ def test_a_change_that_cannot_be_stored_is_refused_and_not_done(site, monkeypatc
     assert sorted(site.status().streams) == ["gate", "roof"]
 
 
-def test_while_the_store_hangs_the_registry_answers_and_streams_are_watched(site, ray, monkeypatch, until):
+def test_registry_answers_while_the_store_hangs(site, ray, monkeypatch, until):
     hangs, goes_on = threading.Event(), threading.Event()
 
     def put(*_):
@@ -276,7 +276,7 @@ def test_while_the_store_hangs_the_registry_answers_and_streams_are_watched(site
     assert sorted(site.status().streams) == ["gate"]
 
 
-def test_a_restarted_controller_waits_for_its_store(made, ray, spec, monkeypatch):
+def test_restarted_controller_waits_for_its_store(made, ray, spec, monkeypatch):
     before = made()
     before.apply(spec, {})
     before.end()
@@ -294,7 +294,7 @@ def test_a_restarted_controller_waits_for_its_store(made, ray, spec, monkeypatch
     assert sorted(again.status().streams) == ["gate", "roof"]
 
 
-def test_a_stream_that_is_not_placed_or_silent_is_reported_long_before_its_restart(made, spec, ray, monkeypatch):
+def test_pending_or_silent_stream_is_reported_before_its_restart(made, spec, ray, monkeypatch):
     now = time.monotonic()
     monkeypatch.setattr(time, "monotonic", lambda: now)
     site = made()
@@ -312,7 +312,7 @@ def test_a_stream_that_is_not_placed_or_silent_is_reported_long_before_its_resta
     assert (roof.state, roof.trouble) == ("starting", unplaced)
 
 
-def test_one_that_hangs_is_started_again_and_one_that_does_not_stop_is_killed(site, ray, monkeypatch):
+def test_hanging_actor_is_restarted_and_killed_if_it_does_not_stop(site, ray, monkeypatch):
     running(site, ray, "gate")
     gate, roof = ray.of("gate"), ray.of("roof")
     gate.status = None
@@ -334,7 +334,7 @@ def test_one_that_hangs_is_started_again_and_one_that_does_not_stop_is_killed(si
     assert "gate" not in site._actors
 
 
-def test_all_streams_are_stopped_before_a_fleet_ends(site, ray):
+def test_streams_are_stopped_before_the_fleet_ends(site, ray):
     running(site, ray, "gate")
     running(site, ray, "roof")
     gate = ray.of("gate")
@@ -350,7 +350,7 @@ def test_all_streams_are_stopped_before_a_fleet_ends(site, ray):
     assert site.end() == ["gate: the store is full"]
 
 
-def test_a_controller_after_the_end_of_a_fleet_runs_nothing_before_the_first_up(site, ray, made, spec):
+def test_controller_of_an_ended_fleet_runs_nothing_before_up(site, ray, made, spec):
     for _ in range(4):
         site.close()
         site._turn()

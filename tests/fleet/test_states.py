@@ -264,11 +264,11 @@ class Fencing(RuleBasedStateMachine):
         assert newest[: len(self.written)] == self.written
 
 
-def test_after_a_claim_no_older_holder_adds_a_state_and_nothing_acknowledged_is_lost():
+def test_claim_fences_older_writers_and_loses_no_acknowledged_state():
     run_state_machine_as_test(Fencing, settings=settings(max_examples=200, stateful_step_count=20, deadline=None))
 
 
-def test_a_late_write_does_not_bring_a_removed_stream_back():
+def test_late_write_does_not_restore_a_removed_stream():
     memory = Memory()
     states = StateStore(memory, FOLDER)
     claim = states.claim()

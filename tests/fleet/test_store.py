@@ -61,7 +61,7 @@ def listed(store, stream="cam-7"):
     return sorted(found.claims), sorted(map(tuple, found.states))
 
 
-def test_two_states_stay_and_a_later_holder_removes_those_of_earlier_ones(store):
+def test_two_states_stay_until_a_later_claim_has_written_two(store):
     claim = store.stream("cam-7").claim()
     for frame in range(9):
         claim.write(STATE, {"frame": frame})
@@ -73,7 +73,7 @@ def test_two_states_stay_and_a_later_holder_removes_those_of_earlier_ones(store)
     assert listed(store) == ([2], [(2, 1), (2, 2)])
 
 
-def test_a_removed_stream_begins_anew_and_its_old_holder_is_fenced(store):
+def test_removed_stream_starts_empty_and_fences_its_old_writer(store):
     old = store.stream("cam-7").claim()
     old.write(STATE, {"frame": 1})
     store.stream("cam-7").clear()
@@ -86,7 +86,7 @@ def test_a_removed_stream_begins_anew_and_its_old_holder_is_fenced(store):
     assert (new.state, new.token > old.token) == (None, True)
 
 
-def test_a_folder_that_is_not_there_is_not_created_by_a_claim(tmp_path):
+def test_missing_folder_is_not_created_by_a_claim(tmp_path):
     """It may be a file system that is not mounted on this machine."""
     store = Store(str(tmp_path / "share"))
     with pytest.raises(StoreError, match="is its file system mounted"):
@@ -95,12 +95,12 @@ def test_a_folder_that_is_not_there_is_not_created_by_a_claim(tmp_path):
     assert store.stream("cam-7").claim().token == 1
 
 
-def test_only_its_owner_may_enter_the_folders_of_a_store(tmp_path):
+def test_folders_of_a_store_are_private(tmp_path):
     Store(str(tmp_path)).check()
     assert [stat.S_IMODE(path.stat().st_mode) for path in tmp_path.iterdir()] == [0o700] * 3
 
 
-def test_a_full_disk_is_a_store_error_and_the_next_write_succeeds(tmp_path):
+def test_full_disk_is_a_store_error_and_a_later_write_succeeds(tmp_path):
     claim = Store(str(tmp_path)).stream("cam-7").claim()
     claim.write(STATE, {"frame": 1})
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
@@ -116,7 +116,7 @@ def test_a_full_disk_is_a_store_error_and_the_next_write_succeeds(tmp_path):
     assert Store(str(tmp_path)).stream("cam-7").newest().facts == {"frame": 3}
 
 
-def test_what_a_killed_writer_left_is_removed_by_the_next_holder(tmp_path):
+def test_partial_state_of_a_killed_writer_is_removed(tmp_path):
     store = Store(str(tmp_path))
     store.stream("cam-7").claim().write(STATE, {})
     part = tmp_path / "streams" / "cam-7" / "00000001" / "00000002#1"
@@ -127,7 +127,7 @@ def test_what_a_killed_writer_left_is_removed_by_the_next_holder(tmp_path):
     assert not part.parent.exists()
 
 
-def test_a_server_that_never_answers_is_a_store_error_after_the_time_limit(monkeypatch):
+def test_silent_server_is_a_store_error_after_the_timeout(monkeypatch):
     with socket.create_server(("127.0.0.1", 0)) as silent:
         monkeypatch.setattr(module, "STORE_SECONDS", 0.2)
         monkeypatch.setenv("AWS_ENDPOINT_URL", "http://{}:{}".format(*silent.getsockname()))
@@ -147,7 +147,7 @@ def test_a_server_that_never_answers_is_a_store_error_after_the_time_limit(monke
         "s3://Not-To-Be-Seen",
     ],
 )
-def test_a_url_with_credentials_or_of_another_kind_is_refused_and_not_repeated(url):
+def test_invalid_url_is_rejected_without_its_credentials(url):
     with pytest.raises(FleetError) as refused:
         Store(url)
     assert "not-to-be-seen" not in str(refused.value).lower()
@@ -155,7 +155,7 @@ def test_a_url_with_credentials_or_of_another_kind_is_refused_and_not_repeated(u
 
 @pytest.mark.usefixtures("s3_server")
 @pytest.mark.parametrize("url", ["s3://fleet/p", "s3://no-such-bucket/p", "s3://unreachable/p"])
-def test_no_credential_is_in_a_message_a_traceback_or_a_log(url, caplog, monkeypatch):
+def test_errors_and_logs_contain_no_credentials(url, caplog, monkeypatch):
     caplog.set_level(logging.DEBUG)
     if "unreachable" in url:
         monkeypatch.setenv("AWS_ENDPOINT_URL", "http://user:password-not-to-be-seen@127.0.0.1:9")
@@ -168,7 +168,7 @@ def test_no_credential_is_in_a_message_a_traceback_or_a_log(url, caplog, monkeyp
 
 
 @pytest.mark.usefixtures("s3_server")
-def test_a_missing_bucket_and_missing_credentials_are_named(monkeypatch):
+def test_missing_bucket_and_missing_credentials_are_named(monkeypatch):
     with pytest.raises(StoreError, match=r"answered NoSuchBucket: check the bucket, its region \(AWS_REGION\)"):
         Store("s3://no-such-bucket").stream("cam-7").claim()
     for name in SECRETS:
@@ -179,7 +179,7 @@ def test_a_missing_bucket_and_missing_credentials_are_named(monkeypatch):
 
 
 @pytest.mark.usefixtures("s3_server")
-def test_a_server_that_ignores_if_none_match_is_refused(monkeypatch):
+def test_server_that_ignores_if_none_match_is_rejected(monkeypatch):
     store = Store("s3://fleet/overwrites")
     monkeypatch.setattr(S3Store, "put", lambda *given, **_: obstore.put(*given))
     with pytest.raises(StoreError, match="ignores If-None-Match"):

@@ -30,7 +30,7 @@ def oracle(centres: np.ndarray) -> pykalman.KalmanFilter:
 
 
 @pytest.mark.parametrize("missing", [0, 20])
-def test_the_motion_model_agrees_with_pykalman_also_if_centres_are_missing(rng, missing):
+def test_motion_model_agrees_with_pykalman(rng, missing):
     centres = walk(rng)
     centres[rng.permutation(62)[:missing] + 1] = np.nan
     learned, expected = learn_motion(centres, 10), oracle(centres).em(np.ma.masked_invalid(centres), n_iter=10)
@@ -40,7 +40,7 @@ def test_the_motion_model_agrees_with_pykalman_also_if_centres_are_missing(rng, 
         assert_array_equal(covariance, covariance.T, "symmetric to the bit")
 
 
-def test_frames_before_the_first_and_after_the_last_centre_change_nothing(rng):
+def test_frames_outside_the_first_and_last_centre_are_ignored(rng):
     centres = walk(rng)
     absent = np.full((5, 2), np.nan)
     inner, padded = learn_motion(centres), learn_motion(np.vstack([absent, centres, absent]))
@@ -59,7 +59,7 @@ def test_perfect_motion_gives_small_positive_definite_covariances(centres):
 
 
 @pytest.mark.parametrize(("frames", "count"), [(0, 0), (64, 0), (64, 1), (64, FEWEST - 1)])
-def test_too_few_centres_give_nothing(rng, frames, count):
+def test_too_few_centres_give_no_motion(rng, frames, count):
     centres = np.full((frames, 2), np.nan)
     centres[3 : 3 + count] = rng.normal(size=(count, 2))
     assert learn_motion(centres) is None

@@ -27,23 +27,15 @@ def with_tree(sample, name, summary):
     return dataclasses.replace(sample, trees=sample.trees | {name: summary})
 
 
-@pytest.fixture
-def cuts(sample, rng):
-    """Random rows of cuts with random labels of extent, size and aspect: rows, labels, and the sample with them."""
-    x, labels = rng.normal(size=(40, len(sample.trees["object"].mean))), rng.uniform(size=(40, 3))
-    rows = np.column_stack([x, np.ones(40), labels]).astype(np.float32)
-    return x, labels, with_tree(sample, "extent", Summary(rows, rows.mean(axis=0), 40, (0,)))
-
-
 @pytest.mark.parametrize("classifier", ["joint", "least-squares", "one-class"])
-def test_the_score_is_0_at_the_backgrounds_mean_and_1_at_the_objects(sample, classifier):
+def test_score_is_0_at_the_background_mean_and_1_at_the_object_mean(sample, classifier):
     model = Trainer(Settings(training={"classifier": classifier})).train(sample)
     assert model.weights @ sample.trees["background"].mean + model.bias == pytest.approx(0, abs=1e-4)
     assert model.weights @ sample.trees["object"].mean + model.bias == pytest.approx(1, abs=1e-4)
     assert (model.version, model.frame, model.weights.dtype) == (sample.version, sample.frame, np.float32)
 
 
-def test_a_model_does_not_depend_on_the_samples_before_it(sample, rng):
+def test_model_depends_on_its_own_sample_only(sample, rng):
     rows = rng.normal(size=sample.trees["extent"].rows.shape).astype(np.float32)
     other = with_tree(sample, "extent", dataclasses.replace(sample.trees["extent"], rows=rows))
     trainer = Trainer(Settings())
@@ -61,26 +53,23 @@ def test_centres_give_a_motion(sample):
     assert Trainer(Settings()).train(sample).motion is None
 
 
-def test_the_sum_of_score_and_extent_predicts_how_well_a_cut_fits(cuts):
-    x, labels, sample = cuts
-    model = Trainer(Settings()).train(sample)
-    together, fits = x @ (model.weights + model.heads["extent"]), labels[:, 0]
-    np.testing.assert_allclose(together - together.mean(), fits - fits.mean(), atol=1e-2)
-
-
-def test_the_heads_of_size_and_aspect_predict_their_label(cuts):
-    x, labels, sample = cuts
-    model = Trainer(Settings()).train(sample)
-    for name, label in (("size", labels[:, 1]), ("aspect", labels[:, 2])):
+def test_heads_predict_the_labels_of_cuts(sample, rng):
+    x, labels = rng.normal(size=(40, len(sample.trees["object"].mean))), rng.uniform(size=(40, 3))
+    rows = np.column_stack([x, np.ones(40), labels]).astype(np.float32)
+    model = Trainer(Settings()).train(with_tree(sample, "extent", Summary(rows, rows.mean(axis=0), 40, (0,))))
+    extent, size, aspect = labels.T
+    together = x @ (model.weights + model.heads["extent"])
+    np.testing.assert_allclose(together - together.mean(), extent - extent.mean(), atol=1e-2)
+    for name, label in (("size", size), ("aspect", aspect)):
         np.testing.assert_allclose(x @ model.heads[name] + model.biases[name], label, atol=1e-2)
 
 
-def test_an_object_like_the_background_is_rejected(sample):
+def test_object_like_the_background_is_rejected(sample):
     with pytest.raises(ProtocolError, match="choose another box"):
         Trainer(Settings()).train(with_tree(sample, "object", sample.trees["background"]))
 
 
-def test_weights_that_score_the_object_lower_are_replaced_by_those_between_the_means(sample):
+def test_weights_that_score_the_object_lower_are_replaced(sample):
     """The rows of a tiny coreset may lie beyond the background, seen from the mean of all they stand for."""
     there, background = sample.trees["object"], sample.trees["background"].mean
     few = with_tree(sample, "object", dataclasses.replace(there, rows=2 * background - there.rows))
