@@ -1,10 +1,7 @@
 """The database of a run: each frame is in it at once, others read it meanwhile, and a resumed run continues it."""
 
-import json
-import signal
+import shutil
 import sqlite3
-import subprocess
-import sys
 from contextlib import closing
 from dataclasses import replace
 
@@ -22,17 +19,6 @@ TRACKS = [
     Track(1, 0.04, "absent", None, 0.125, 3, 17.5, "anna", 1),
     Track(3, 0.12, "present", Box(-2.0, 21.0, 30.0, 40.0), 0.43, 4, 18.5, "anna", 1, doubtful=True),
 ]
-
-KILLED = """
-import json, os, signal, sys
-from pathlib import Path
-from catstream.output.destinations import Origin, TrackedFrame, open_sink
-from catstream.output.track_log import Log
-sink = open_sink(sys.argv[1], Origin())
-for frame in Log(Path(sys.argv[2])):
-    sink.write(frame)
-os.kill(os.getpid(), signal.SIGKILL)
-"""
 
 
 def read(path):
@@ -54,19 +40,18 @@ def test_readers_see_each_frame_at_once_and_block_nothing(tmp_path):
 
 
 def test_database_of_a_killed_run_is_continued_after_its_last_frame(tmp_path):
-    path = tmp_path / "t.sqlite"
-    log = tmp_path / "tracks.ndjson"
-    log.write_text("".join(f"{json.dumps(track.to_dict())}\n" for track in TRACKS[:2]))
-    killed = subprocess.run([sys.executable, "-P", "-c", KILLED, path, log], check=False)
-    assert killed.returncode == -signal.SIGKILL
+    with closing(open_sink(str(tmp_path / "t.sqlite"), Origin())) as sink:
+        for each in TRACKS[:2]:
+            sink.write(TrackedFrame([each]))
+        killed = shutil.copytree(tmp_path, tmp_path / "killed")  # the files as they are before the end
+    path, log = killed / "t.sqlite", killed / "t.ndjson"
     run = RunFiles(Origin(), None, [str(path)])
     run.check(overwrite=False, earlier=run.destinations)
     assert run.position()[0] == 2
-    more = replace(run, destinations=[*run.destinations, str(tmp_path / "t.ndjson")])
-    with more.opened("", resume=True) as files:
-        assert read(path) == read(tmp_path / "t.ndjson") == [[each] for each in TRACKS[:2]]
+    with replace(run, destinations=[str(path), str(log)]).opened("", resume=True) as files:
+        assert read(path) == read(log) == [[each] for each in TRACKS[:2]]
         files.write(TrackedFrame(TRACKS[2:]))
-    assert read(path) == read(tmp_path / "t.ndjson") == [[each] for each in TRACKS]
+    assert read(path) == read(log) == [[each] for each in TRACKS]
 
 
 @pytest.mark.parametrize("begun", ["", "PRAGMA journal_mode = WAL"])

@@ -1,11 +1,11 @@
-"""The table of options: a value that is invalid or has no effect is an error before the run."""
+"""Addresses of destinations and their options: what is invalid or has no effect is an error before the run."""
 
 from pathlib import Path
 
 import pytest
 
-from catstream.errors import SettingsError
-from catstream.output.destinations import SinkOptions
+from catstream.errors import SettingsError, VideoError
+from catstream.output.destinations import SinkOptions, check_sink
 from catstream.output.options import parse
 from catstream.wire.channels import HEALTH
 from catstream.wire.messages import Health
@@ -77,3 +77,27 @@ def test_sink_rejects_a_zone_outside_the_frame(fail, endpoint, turning):
     with Publisher(HEALTH, endpoint, "detector") as health, turning(lambda: health.send(report)):
         error = fail("sink", HOOK, "--zone", "door=4000,10 4900,10 4900,90", "--endpoint", endpoint)
     assert "zone door: it is outside the frame of 320x240 pixels" in error
+
+
+@pytest.mark.parametrize(
+    ("place", "words"),
+    [
+        ("mqtt://host/", "has no valid topic"),
+        ("mqtt://host/a/#", "has no valid topic"),
+        ("mqtt://me:1/secret@host/a", "percent-encode a /"),
+        ("mqtt://host:99999/a", "port has to be 1 to 65535"),
+        ("mqtt://me:secret@host:0/a", r"port has to be 1 to 65535\): expected mqtt://"),
+        ("mqtt://fe80::1:2/a", "IPv6 address is in brackets"),
+        ("mqtt://:1883/a", "host is missing"),
+        ("mqtts://me:sec/secret@host/a", "expected mqtt://"),
+        ("http://", "expected https://"),
+        ("https://me:secret@/hook", "expected https://"),
+        ("http://host:0/secret", "expected https://"),
+        ("http://host/secret hook", "a space is %20"),
+        ("ftp://me:secret@host/one", "is not a destination"),
+    ],
+)
+def test_invalid_address_is_an_error_without_its_password(place, words):
+    with pytest.raises(VideoError, match=words) as error:
+        check_sink(place, SinkOptions())
+    assert "secret" not in str(error.value)
