@@ -7,8 +7,7 @@ import signal
 import socket
 import subprocess
 import sys
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, suppress
 from dataclasses import replace
 from importlib import import_module
 
@@ -46,15 +45,6 @@ def home(tmp_path_factory):
         yield home / "catstream" / "fleets"
 
 
-def command(*words):
-    return [sys.executable, "-P", "-c", "from catstream.cli import main; main()", *map(str, words)]
-
-
-def run(*words):
-    """A command from its start to its end."""
-    return subprocess.run(command(*words), capture_output=True, text=True, timeout=500, check=False)
-
-
 def listening(process):
     """The addresses at which a process listens; none if it has ended."""
     with suppress(psutil.Error):
@@ -72,44 +62,39 @@ def file(tmp_path):
     return tmp_path / "local.toml"
 
 
-@contextmanager
-def local(file, until, *options):
-    """`catstream fleet up` in the foreground, once the stream runs."""
-    words, name = command("fleet", "up", file, *options), options[-1] if options else "local"
-    both = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-    with subprocess.Popen(words, **both, text=True, start_new_session=True) as up:
-        try:
-            until(lambda: up.poll() is not None or name in fleets())
-            assert up.poll() is None, up.communicate()[1]
-            with Registry(name, timeout=500) as registry:
-                until(lambda: [each.state for each in registry.streams().streams.values()] == ["running"])
-            yield up
-        finally:
-            if up.poll() is None:
-                up.kill()
+@pytest.fixture
+def local(home, file, catstream, until):  # noqa: ARG001  # its folder is in the environment
+    """Starts `catstream fleet up` in the foreground: its process, and those of Ray, once the stream runs."""
+
+    def start(name="local"):
+        up = catstream("fleet", "up", file, "--name", name, start_new_session=True)
+        until(lambda: up.poll() is not None or name in fleets())
+        assert up.poll() is None, up.communicate()[1]
+        with Registry(name, timeout=500) as registry:
+            until(lambda: [each.state for each in registry.streams().streams.values()] == ["running"])
+        return up, psutil.Process(up.pid).children(recursive=True)
+
+    return start
 
 
-@pytest.mark.usefixtures("home")
-def test_a_local_fleet_is_closed_to_other_machines_and_users_until_ctrl_c(file, home, alive, until):
-    with local(file, until) as up:
-        processes = psutil.Process(up.pid).children(recursive=True)
-        found = set().union(*map(listening, processes))
-        assert found
-        assert found <= {"127.0.0.1", "::1", "::ffff:127.0.0.1"}
-        folder = home / "local"
-        assert (folder / "token").stat().st_mode & 0o077 == 0
-        (file.parent / "token").write_text("0" * 64)
-        other = {"RAY_AUTH_TOKEN_PATH": str(file.parent / "token"), "RAY_NUM_REDIS_GET_RETRIES": "2"}
-        stranger = os.environ | _VARIABLES | other
-        program = f"import ray; ray.init({(folder / 'address').read_text()!r}); print('let in')"
-        words = [sys.executable, "-P", "-c", program]
-        done = subprocess.run(words, env=stranger, capture_output=True, text=True, timeout=500, check=False)
-        assert (done.returncode, "let in" in done.stdout) == (1, False)
-        assert "token" in done.stderr.lower()
-        started = [each for each in processes if "StreamActor" in each.name()]
-        assert [each.nice() for each in started] == [os.getpriority(os.PRIO_PROCESS, 0)]
-        os.killpg(up.pid, signal.SIGINT)  # as a terminal does
-        check_ended(up, processes, home, alive, until)
+def test_local_fleet_is_closed_to_other_machines_and_users_until_ctrl_c(local, tmp_path, home, alive, until):
+    up, processes = local()
+    addresses = set().union(*map(listening, processes))
+    assert addresses
+    assert addresses <= {"127.0.0.1", "::1", "::ffff:127.0.0.1"}
+    folder = home / "local"
+    assert (folder / "token").stat().st_mode & 0o077 == 0
+    (tmp_path / "token").write_text("0" * 64)
+    other = {"RAY_AUTH_TOKEN_PATH": str(tmp_path / "token"), "RAY_NUM_REDIS_GET_RETRIES": "2"}
+    program = f"import ray; ray.init({(folder / 'address').read_text()!r}); print('let in')"
+    words, environment = [sys.executable, "-P", "-c", program], os.environ | _VARIABLES | other
+    done = subprocess.run(words, env=environment, capture_output=True, text=True, timeout=500, check=False)
+    assert (done.returncode, "let in" in done.stdout) == (1, False)
+    assert "token" in done.stderr.lower()
+    started = [each for each in processes if "StreamActor" in each.name()]
+    assert [each.nice() for each in started] == [os.getpriority(os.PRIO_PROCESS, 0)]
+    os.killpg(up.pid, signal.SIGINT)  # as a terminal does
+    check_ended(up, processes, home, alive, until)
 
 
 def check_ended(up, processes, home, alive, until):
@@ -121,37 +106,34 @@ def check_ended(up, processes, home, alive, until):
     assert Store(str(home / "local" / "store")).stream("gate").newest().facts["frame"] > 0
 
 
-@pytest.mark.usefixtures("home")
-def test_sigterm_ends_a_local_fleet_as_ctrl_c_does(file, home, alive, until):
-    with local(file, until) as up:
-        processes = psutil.Process(up.pid).children(recursive=True)
-        up.terminate()  # as systemd does; Ray has a handler of its own
-        check_ended(up, processes, home, alive, until)
+def test_sigterm_ends_a_local_fleet_as_ctrl_c_does(local, home, alive, until):
+    up, processes = local()
+    up.terminate()  # as systemd does; Ray has a handler of its own
+    check_ended(up, processes, home, alive, until)
 
 
-@pytest.mark.usefixtures("home")
 @pytest.mark.parametrize("victim", ["raylet", "gcs_server"])
-def test_a_local_fleet_ends_with_its_streams_and_keeps_its_logs_if_ray_dies(file, home, alive, until, victim):
-    with local(file, until) as up:
-        processes = psutil.Process(up.pid).children(recursive=True)
-        next(each for each in processes if each.name() == victim).kill()
-        said = up.communicate(timeout=500)[1]
-        assert up.returncode == 1
-        assert f"the fleet local has ended, because Ray's {victim} has died (exit status -9): start it again" in said
-        until(lambda: not any(alive(each.pid) for each in processes))  # no orphan writes beside the next start
-        assert (home / "local" / "logs" / f"{victim}.out").exists()
+def test_local_fleet_ends_with_its_streams_if_ray_dies(local, home, alive, until, victim):
+    up, processes = local()
+    next(each for each in processes if each.name() == victim).kill()
+    errors = up.communicate(timeout=500)[1]
+    assert up.returncode == 1
+    assert f"the fleet local has ended, because Ray's {victim} has died (exit status -9): start it again" in errors
+    until(lambda: not any(alive(each.pid) for each in processes))  # no orphan writes during the next run
+    assert (home / "local" / "logs" / f"{victim}.out").exists()
 
 
-@pytest.mark.usefixtures("home")
-def test_a_second_up_changes_a_fleet_that_runs_and_down_ends_it_from_elsewhere(file, until):
-    with ThreadPoolExecutor(1) as pool, local(file, until, "--name", "other") as up:
-        second = pool.submit(run, "fleet", "up", file, "--name", "other").result()
-        assert (second.returncode, second.stdout.splitlines()[0]) == (0, "gate: is unchanged")
-        assert list(json.loads(run("fleet", "status", "--fleet", "other", "--json").stdout)["streams"]) == ["gate"]
-        assert run("fleet", "down", "--name", "other").stdout == "the fleet other is down\n"
-        assert "the fleet other was ended from elsewhere" in up.communicate(timeout=500)[0]
+def test_second_up_changes_a_fleet_and_down_ends_it_from_elsewhere(local, catstream, file):
+    def run(*words):
+        return catstream("fleet", *words).communicate(timeout=500)
+
+    up, _ = local("other")
+    assert run("up", file, "--name", "other")[0].splitlines()[0] == "gate: is unchanged"
+    assert list(json.loads(run("status", "--fleet", "other", "--json")[0])["streams"]) == ["gate"]
+    assert run("down", "--name", "other")[0] == "the fleet other is down\n"
+    assert "the fleet other was ended from elsewhere" in up.communicate(timeout=500)[0]
     assert up.returncode == 0
-    assert "no fleet 'other' of yours runs" in run("fleet", "down", "--name", "other").stderr
+    assert "no fleet 'other' of yours runs" in run("down", "--name", "other")[1]
 
 
 # On a cluster.
@@ -195,16 +177,23 @@ def site(cluster, streams, tmp_path_factory):
         assert site.down() == []
 
 
-def state_of(fleet, name, until, *states):
-    """The status of a stream once it has one of these states."""
-    return until(lambda: (found := fleet.status().streams[name]).state in states and found)
+@pytest.fixture
+def status_of(site, until):
+    """A function that returns the status of a stream once it has this state, and runs on this node if one is named."""
+
+    def wait(name, state="running", node=""):
+        def current():
+            status = site[0].status().streams[name]
+            return status.state == state and node in ("", status.node) and status
+
+        return until(current)
+
+    return wait
 
 
-def test_a_subscriber_with_a_key_of_the_fleet_stays_attached_to_a_stream_that_moves(
-    site, streams, until, home, tmp_path
-):
+def test_subscriber_with_a_key_stays_attached_to_a_stream_that_moves(site, streams, status_of, until, home, tmp_path):
     fleet, spec = site
-    before = state_of(fleet, "gate", until, "running")
+    before = status_of("gate")
     allow(home / "site" / "keys", "desk", "watch", output=tmp_path / "desk")
     other = "south" if before.node == "north" else "north"
     address, keys = f"fleet://{spec.registry}/gate", str(tmp_path / "desk")
@@ -217,7 +206,7 @@ def test_a_subscriber_with_a_key_of_the_fleet_stays_attached_to_a_stream_that_mo
 
         tracks, first = until(attached)
         fleet.add(replace(streams["gate"], labels={"ray.io/node-id": node_id(other)}))
-        until(lambda: (found := fleet.status().streams["gate"]).node == other and found.state == "running")
+        status_of("gate", node=other)
         endpoint = tracks.endpoint
         next(track for track in tracks if tracks.endpoint != endpoint)
     assert first.object == "anna"
@@ -225,7 +214,7 @@ def test_a_subscriber_with_a_key_of_the_fleet_stays_attached_to_a_stream_that_mo
     fleet.add(replace(streams["gate"], labels={"site": "west"}))
     until(lambda: "Ray has not started it" in fleet.status().streams["gate"].trouble)
     fleet.add(streams["gate"])
-    state_of(fleet, "gate", until, "running")
+    status_of("gate")
 
 
 def node_id(name):
@@ -233,31 +222,28 @@ def node_id(name):
     return next(node["NodeID"] for node in nodes() if node["NodeName"] == name)
 
 
-def test_a_stream_runs_on_a_node_with_its_labels_and_moves_when_the_node_dies(site, cluster, streams, until):
+def test_stream_runs_on_a_node_with_its_labels_and_moves_if_it_dies(site, cluster, streams, status_of, until):
     fleet, spec = site
     fleet.add(replace(streams["gate"], labels={"site": "south"}))
-    until(lambda: (found := fleet.status().streams["gate"]).node == "south" and found.state == "running")
+    status_of("gate", node="south")
     fleet.add(StreamSpec("full", LIVE, cores=0.8, labels={"ray.io/node-id": node_id("north")}))
-    state_of(fleet, "full", until, "waiting")
+    status_of("full", "waiting")
     fleet.add(streams["gate"])  # it may run anywhere, and only this node has room
-    until(lambda: (found := fleet.status().streams["gate"]).node == "south" and found.state == "running")
+    status_of("gate", node="south")
     fleet.remove("full", forget=True)
-    token = fleet.status().streams["gate"].token
-    until(lambda: (state := Store(spec.store).stream("gate").newest()) is not None and state.token == token)
-    before = fleet.status().streams["gate"]
+    stored = Store(spec.store).stream("gate")
+    until(lambda: (state := stored.newest()) is not None and state.token == status_of("gate").token)
+    before = status_of("gate")
     cluster.remove_node(cluster.south, allow_graceful=False)
-    until(lambda: (found := fleet.status().streams["gate"]).token > before.token and found.state == "running")
-    assert fleet.status().streams["gate"].node == "north"
+    assert status_of("gate", node="north").token > before.token
     until(lambda: fleet.status().nodes["south"].state == "dead")
     cluster.south = cluster.add_node(**SOUTH)
     until(lambda: fleet.status().nodes["south"].state == "alive")
 
 
-def test_a_controller_that_dies_is_started_again_and_streams_run_on(site, until):
+def test_controller_that_dies_is_restarted_while_streams_continue(site, status_of):
     fleet, _ = site
-    before = state_of(fleet, "gate", until, "running")
-    ray = import_module("ray")
-    ray.kill(fleet._controller, no_restart=False)
-    after = state_of(fleet, "gate", until, "running")
-    assert after.token == before.token
+    before = status_of("gate")
+    import_module("ray").kill(fleet._controller, no_restart=False)
+    assert status_of("gate").token == before.token
     assert fleet.is_running
