@@ -1,11 +1,8 @@
 """The server of `catstream annotate`: its state, pictures of frames, changes, and what it rejects."""
 
 import json
-import os
-from contextlib import contextmanager
 
 import cv2
-import httpx
 import numpy as np
 import pytest
 
@@ -47,16 +44,12 @@ def page(sessions, serve_site):
 @pytest.fixture
 def edit(page):
     def change(verb, **fields):
-        answer = send(page, verb, **fields)
+        answer = page.post("/edit", json={"server": state(page)["server"], "verb": verb, **fields})
         result = answer.json()
         result.pop("revision", None)
         return answer.status_code, result
 
     return change
-
-
-def send(page, verb, **fields):
-    return page.post("/edit", json={"server": state(page)["server"], "verb": verb, **fields})
 
 
 def state(page):
@@ -70,7 +63,7 @@ def test_picture_of_a_frame_is_that_of_the_video(page, session):
     assert page.get(f"/frames/{FRAMES}.jpg").status_code == page.get(f"/frames/{FRAMES}").status_code == 404
 
 
-def test_boxes_are_drawn_marked_absent_renamed_and_undone(page, edit, demo):
+def test_boxes_are_drawn_marked_absent_renamed_and_undone(page, edit, demo, session):
     truth = [[*box] for box in demo[1]]
     assert edit("draw", object="anna", frame=0, box=truth[0]) == (200, {"done": True})
     assert edit("draw", object="anna", frame=10, box="hidden") == (200, {"done": True})
@@ -87,6 +80,8 @@ def test_boxes_are_drawn_marked_absent_renamed_and_undone(page, edit, demo):
     assert frame["objects"]["ben"] == {"box": None, "checked": "keyframe", "proposals": [None, None]}
     assert edit("undo") == (200, {"done": True, "object": "anna", "frame": None})
     assert edit("undo") == (200, {"done": True, "object": "anna", "frame": 11})
+    assert edit("done") == (200, {"done": True})
+    assert session.finished.is_set()
 
 
 def test_unchecked_frame_has_the_proposals_of_both_directions(page, edit, demo, session, until):
@@ -143,39 +138,21 @@ def test_tab_of_an_earlier_server_changes_nothing(session, sessions, serve_site,
     assert earlier.post("/edit", json=fields).status_code == 200
 
 
-@pytest.fixture
-def serving(catstream, demo, tmp_path):
-    """Starts the command: its process, and a client of its page."""
+def test_interrupted_command_continues_from_its_boxes(said, demo, tmp_path, monkeypatch, until):
+    def annotate(frame, interrupted):
+        def draw(sessions, _):
+            until(lambda: sessions.current.decoded)
+            sessions.current.draw("anna", frame, demo[1][frame])
+            return interrupted
 
-    @contextmanager
-    def start():
-        words = ["annotate", demo[0], "--output", tmp_path / "out", "--listen", 0, "--jobs", 1]
-        process = catstream(*words, env=os.environ | {"PYTHONUNBUFFERED": "1"})
-        link = process.stdout.readline().strip()
-        with httpx.Client(base_url=link.partition("?")[0], timeout=500, follow_redirects=True) as client:
-            assert client.get(link).status_code == 200
-            yield process, client
+        monkeypatch.setattr("catstream.cli.annotate.serve", draw)
+        return said("annotate", demo[0], "--output", tmp_path / "out", "--jobs", 1)
 
-    return start
-
-
-def test_interrupted_command_is_continued_until_it_is_done(serving, demo, tmp_path, until):
-    box = [*demo[1][0]]
-    with serving() as (process, client):
-        until(lambda: state(client)["decoded"])
-        send(client, "draw", object="anna", frame=0, box=box)
-        process.terminate()
-        assert process.wait(500) == 143
-    assert (tmp_path / "out" / "keyframes.csv").read_text().splitlines()[1].startswith("0,anna,")
+    code, _, errors = annotate(0, interrupted=True)
+    assert (code, "the same command continues" in errors) == (130, True)
     assert (tmp_path / "out" / "demo.ndjson").exists()
-    with serving() as (process, client):
-        until(lambda: state(client)["decoded"])
-        assert [one["name"] for one in state(client)["objects"]] == ["anna"]
-        send(client, "draw", object="anna", frame=FRAMES - 1)
-        assert send(client, "done").json()["done"]
-        assert process.wait(500) == 0
-        assert "2 keyframes" in process.stdout.read()
-    assert len((tmp_path / "out" / "demo.csv").read_text().splitlines()) == FRAMES + 1
+    code, output, _ = annotate(FRAMES - 1, interrupted=False)
+    assert (code, "2 keyframes" in output) == (0, True)
 
 
 def test_only_changes_are_sent_and_timelines_are_bounded(session, edit, page, demo, until, monkeypatch):
