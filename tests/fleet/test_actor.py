@@ -14,7 +14,6 @@ from catstream.fleet.actor import Stream
 from catstream.fleet.spec import StreamSpec
 from catstream.fleet.store import Claim, Store
 from catstream.video.live_demo import first_box
-from catstream.video.source import open_source
 from catstream.wire import discovery
 from catstream.wire.discovery import free_ports
 
@@ -150,12 +149,9 @@ def test_upload_rate_is_limited_except_after_a_command_or_failure(store, until, 
         assert Store(store).stream("gate").newest().facts["frame"] > last + 100
 
 
-def test_lost_source_is_the_state_and_trouble_of_its_stream(store, camera, demo_video, until):
-    path, boxes = demo_video(FRAMES)
-    with open_source(path) as film:
-        image = next(film).image
+def test_lost_source_is_the_state_and_trouble_of_its_stream(store, camera, image, until):
     gate = camera(lambda _: image)
-    with started(StreamSpec("gate", gate.url, {"": boxes[0]}), store) as stream:
+    with started(StreamSpec("gate", gate.url, {"": Box(60, 60, 80, 80)}), store) as stream:
         until(lambda: stream.report()[0].state == "running")
         assert stream.report()[0].present.keys() == {""}
         gate.leave()

@@ -56,16 +56,12 @@ def locked(serve):
 @pytest.fixture
 def pipeline(endpoint):
     """The health of all three processes, and tracks and pictures, as a pipeline sends them."""
+    publishers = {name: Publisher(HEALTH, endpoint, name) for name in ("detector", "compressor", "trainer")}
+    publishers |= {"tracks": Publisher(TRACKS, endpoint), "previews": Publisher(PREVIEWS, endpoint)}
     with ExitStack() as stack:
-        health = {
-            name: stack.enter_context(Publisher(HEALTH, endpoint, name))
-            for name in ("detector", "compressor", "trainer")
-        }
-        yield {
-            **health,
-            "tracks": stack.enter_context(Publisher(TRACKS, endpoint)),
-            "previews": stack.enter_context(Publisher(PREVIEWS, endpoint)),
-        }
+        for each in publishers.values():
+            stack.enter_context(each)
+        yield publishers
 
 
 @pytest.fixture
@@ -304,13 +300,18 @@ def test_pending_command_is_answered_at_the_end_of_the_server(folder, monkeypatc
 
 
 def test_stalled_viewer_is_disconnected_without_a_traceback(folder, monkeypatch, capsys, until):
+    def is_stalled():
+        before = len(updates)
+        time.sleep(0.5)  # five updates
+        return 0 < before == len(updates)
+
     updates = []
     monkeypatch.setattr("catstream.web.server.SHUTDOWN_SECONDS", 0.5)
     monkeypatch.setattr(Dashboard, "updates", lambda *_: updates.append(1) or {"status": "x" * (1 << 20)})
     server = Server(Site(PipelineFeed(Address(str(folder)))), port=0)
     with socket.create_connection(urlsplit(server.url).netloc.split(":")) as viewer, server.in_background():
         viewer.sendall(b"GET /events HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
-        until(lambda: updates and len(updates) == (time.sleep(0.5), len(updates))[1])
+        until(is_stalled)
     assert capsys.readouterr().err == ""
 
 
