@@ -118,5 +118,7 @@ def test_pages_of_streams_are_closed_without_viewers(fleet, monkeypatch):
 )
 def test_first_readiness_check_of_a_stream_is_answered(fleet, serve_fleet, state, trouble, answer):
     fleet.stream("cam-7", state=state, trouble=trouble)
-    ready = serve_fleet().get("/streams/cam-7/readyz")
+    page = serve_fleet()
+    ready = page.get("/streams/cam-7/readyz")
     assert (ready.status_code, ready.text) == answer
+    assert page.get("/streams/cam-8/readyz").status_code == 404
