@@ -21,7 +21,7 @@ def cells(rng):
 
 def test_score_of_a_window_is_weights_times_row_plus_bias(cells, rng):
     weights = rng.normal(size=ROW_LENGTH).astype(np.float32)
-    weights.flags.writeable = False  # as those of a message
+    weights.flags.writeable = False  # like the weights of a message
     scores = cells.respond(weights, 0.5)
     expected = [[cells.row(row, column) @ weights + 0.5 for column in range(7)] for row in range(4)]
     np.testing.assert_allclose(scores, expected, rtol=1e-4, atol=1e-3)

@@ -74,7 +74,7 @@ def test_live_stream_repeats_no_frame_number_of_its_log(store, until, tmp_path):
     spec = StreamSpec("gate", LIVE, {"": first_box(LIVE)}, write=(str(tmp_path / "gate.ndjson"),))
     with started(spec, store) as stream:
         until(lambda: Store(store).stream("gate").newest() is not None)
-        stream._every = 60.0  # what follows is not stored
+        stream._every = 60.0  # later states are not stored
         until(lambda: stream.report()[0].frame > 60)
         Store(store).stream("gate").claim()
         stream._superseded = True

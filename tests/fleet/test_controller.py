@@ -1,4 +1,4 @@
-"""The controller of a fleet, with a Ray of this file's own: what it starts, stops, stores and answers."""
+"""The controller of a fleet, with a fake Ray: starts, stops, stored specs and answers."""
 
 import sys
 import threading
@@ -110,7 +110,7 @@ def ray(monkeypatch):
     facts = {"NodeManagerAddress": "127.0.0.1", "Resources": {"CPU": 2.0}, "Alive": True}
     fake.nodes = [facts | {"NodeName": f"n{number}", "NodeID": str(number)} for number in (1, 2)]
     monkeypatch.setattr(module, "nodes", lambda: list(fake.nodes))
-    monkeypatch.setattr(module, "_TURN_SECONDS", 1e6)  # a test calls each turn
+    monkeypatch.setattr(module, "_TURN_SECONDS", 1e6)  # a test calls it
     monkeypatch.setattr(module, "die_with", lambda _: None)
     return fake
 
@@ -288,7 +288,7 @@ def test_restarted_controller_waits_for_its_store(made, ray, spec, monkeypatch):
             with pytest.raises(StoreError, match="cannot be reached"):
                 call()
     with Registry("site", timeout=0.5) as registry, pytest.raises(SilenceError):
-        registry.streams()  # an empty answer would be the end of each stream for those who follow it
+        registry.streams()  # an empty answer would end each subscription
     again._begin()
     again.ready()
     assert sorted(again.status().streams) == ["gate", "roof"]

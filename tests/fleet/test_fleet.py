@@ -64,7 +64,7 @@ def file(tmp_path):
 
 @pytest.fixture
 def local(home, file, catstream, until):  # noqa: ARG001  # its folder is in the environment
-    """Starts `catstream fleet up` in the foreground: its process, and those of Ray, once the stream runs."""
+    """Starts `catstream fleet up` in the foreground: its process and its children, once the stream runs."""
 
     def start(name="local"):
         up = catstream("fleet", "up", file, "--name", name, start_new_session=True)
@@ -77,7 +77,7 @@ def local(home, file, catstream, until):  # noqa: ARG001  # its folder is in the
     return start
 
 
-def test_local_fleet_is_closed_to_other_machines_and_users_until_ctrl_c(local, tmp_path, home, alive, until):
+def test_local_fleet_is_closed_to_other_machines_and_users(local, tmp_path, home, alive, until):
     up, processes = local()
     addresses = set().union(*map(listening, processes))
     assert addresses

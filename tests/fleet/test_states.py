@@ -181,7 +181,7 @@ class Fencing(RuleBasedStateMachine):
 
     @rule(number=PROCESSES, count=st.integers(1, 4))
     def write(self, number, count):
-        """Write without a disturbance, which succeeds if nobody has claimed since."""
+        """Write without a fault, which succeeds if there is no later claim."""
         process = self.processes[number]
         for _ in range(count):
             if self.run(process, "write"):
@@ -189,7 +189,7 @@ class Fencing(RuleBasedStateMachine):
 
     @rule(number=PROCESSES)
     def claim_and_write(self, number):
-        """Claim and write without a disturbance, which succeeds whatever happened before."""
+        """Claim and write without a fault, which succeeds after any history."""
         process = self.processes[number]
         if self.run(process, "claim"):
             assert isinstance(process.result, Claim)
@@ -230,7 +230,7 @@ class Fencing(RuleBasedStateMachine):
             files = {"chain": json.dumps(process.chain).encode()}
             task = lambda _: process.claim.write(files, {})  # noqa: E731
         if process.begin(kind, task):
-            self.end(process)  # a fenced holder is told without any call of the store
+            self.end(process)  # a fenced process raises its error without a call of the store
         return True
 
     def step(self, process, fault):

@@ -1,4 +1,4 @@
-"""Events, by histories: what came of tracks, in the order in which they came."""
+"""Events of histories of tracks, of health reports, and in zones."""
 
 import pytest
 from hypothesis import given

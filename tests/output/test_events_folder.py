@@ -37,7 +37,7 @@ def _patient(monkeypatch):
 
 @contextmanager
 def writing(folder, endpoint, until, **options):
-    """A sink that receives the pictures of the publisher that is yielded, too."""
+    """Opens a sink that receives the pictures of a publisher; yields both."""
     with ExitStack() as stack:
         previews = stack.enter_context(Publisher(PREVIEWS, endpoint))
         origin = Origin(address=Address(str(endpoint)), options=SinkOptions(**options))

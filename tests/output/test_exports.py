@@ -138,12 +138,12 @@ def test_format_with_the_frame_size_requires_the_source(tmp_path, name, kind):
 @pytest.mark.parametrize("disk", [1 << 16], indirect=True)
 @pytest.mark.parametrize("suffix", [".txt", ".sqlite", ".json", ".xml", ".via.csv"])
 def test_full_disk_leaves_the_earlier_file_as_it_is(disk, suffix):
-    (disk / f"t{suffix}").write_text("dear to somebody")
+    (disk / f"t{suffix}").write_text("earlier")
     (disk / "ballast").write_bytes(bytes((1 << 16) - 4096))
     with pytest.raises(VideoError, match="cannot write"):
         made(disk / f"t{suffix}", log=[TrackedFrame([present(frame, "")]) for frame in range(999)], size=(100, 80))
     assert {file.name for file in disk.iterdir()} == {"ballast", f"t{suffix}"}
-    assert (disk / f"t{suffix}").read_text() == "dear to somebody"
+    assert (disk / f"t{suffix}").read_text() == "earlier"
 
 
 def test_unknown_suffix_requires_the_option_format(tmp_path):

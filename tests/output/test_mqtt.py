@@ -233,7 +233,7 @@ def test_broker_that_is_back_gets_all_events_but_not_all_states(broker, until, c
         until(lambda: events(got) == [("found", 0.0)])
         assert sink.missed > 0
         until(lambda: sink._acknowledged == sink._published)
-        broker.stop()  # it forgets what was retained
+        broker.stop()  # it loses the retained messages
         until(lambda: "the connection was lost" in caplog.text)
         sink.write(lost(9))
         broker.start()
@@ -249,7 +249,7 @@ def test_broker_that_is_back_gets_all_events_but_not_all_states(broker, until, c
 
 
 @pytest.mark.usefixtures("absent_broker")
-def test_silent_broker_blocks_nothing_and_its_missed_messages_are_counted(monkeypatch, caplog):
+def test_silent_broker_blocks_nothing_and_misses_are_counted(monkeypatch, caplog):
     monkeypatch.setattr(mqtt_sink, "QUEUED", 5)
     monkeypatch.setattr(mqtt_sink, "_REPLY_SECONDS", 0)
     with (

@@ -1,4 +1,4 @@
-"""Addresses of destinations and their options: what is invalid or has no effect is an error before the run."""
+"""Addresses of destinations and their options: an invalid value is an error before the run."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""The log of a run: NDJSON and CSV hold every track at once, and are continued where a crash has cut them."""
+"""The log of a run: NDJSON and CSV contain each track at once, and are continued after a crash."""
 
 import csv
 import errno
@@ -198,7 +198,7 @@ def test_logs_of_a_live_source_rotate_together_and_are_joined(tmp_path, source, 
         list(JoinedLog([Log(tmp_path / "t.csv"), Log(tmp_path / "t.csv")]))
 
 
-def test_a_log_rotates_in_a_new_period_in_utc(tmp_path):
+def test_log_rotates_in_a_new_period_in_utc(tmp_path):
     daily = SinkOptions(rotate=Rotation(86400, inf))
     with closing(open_sink(str(tmp_path / "t.csv"), Origin(options=daily))) as sink:
         sink.write(TrackedFrame(TRACKS[:1]))
@@ -244,7 +244,7 @@ HISTORIES = st.lists(ALIVE, min_size=2, max_size=5)
 @settings(max_examples=120)
 @given(HISTORIES, st.data())
 def test_resumed_run_has_each_row_once_wherever_a_crash_cut_it(history, data):
-    """The run is resumed with a new file, and with all or some of its files; the others stay as they are."""
+    """The run is resumed with a new file and some of its files; the others stay as they are."""
     with tempfile.TemporaryDirectory() as place:
         whole, broken = run_in(Path(place) / "whole", "t.csv"), run_in(Path(place) / "broken")
         add(whole, history)
@@ -252,9 +252,9 @@ def test_resumed_run_has_each_row_once_wherever_a_crash_cut_it(history, data):
         for log in broken.destinations:
             size = Path(log).stat().st_size
             os.truncate(log, size - data.draw(st.integers(0, size)))
-        kept = data.draw(st.lists(st.sampled_from(broken.destinations), min_size=1, unique=True))
-        dropped = {log: Path(log).read_bytes() for log in {*broken.destinations} - {*kept}}
-        again = replace(broken, destinations=[*kept, str(Path(place) / "broken" / "t.csv")])
+        selected = data.draw(st.lists(st.sampled_from(broken.destinations), min_size=1, unique=True))
+        dropped = {log: Path(log).read_bytes() for log in {*broken.destinations} - {*selected}}
+        again = replace(broken, destinations=[*selected, str(Path(place) / "broken" / "t.csv")])
         add(again, history, again.position()[0], resume=True)
         assert rows_of(again).items() <= rows_of(whole).items()
         assert len(rows_of(again)) == len(again.destinations)
@@ -422,7 +422,7 @@ def test_resumed_run_makes_csv_and_database_from_its_ndjson_log(tmp_path):
     places = [str(tmp_path / name) for name in ("t.csv", "t.sqlite", "t.ndjson")]
     run = RunFiles(Origin(), None, places)
     add(run, [[""]] * 5)
-    Path(places[0]).write_text("whatever a power cut has left")
+    Path(places[0]).write_text("damaged by a power cut")
     Path(places[1]).unlink()
     add(run, [[""]] * 9, first=run.position()[0], resume=True)
     for place in places:

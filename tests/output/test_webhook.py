@@ -1,4 +1,4 @@
-"""A webhook: each event arrives once and in order, however long the receiver is away; what is missed is counted."""
+"""A webhook: each event arrives once and in order after any outage, and dropped events are counted."""
 
 import hmac
 import json

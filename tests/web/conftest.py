@@ -1,4 +1,4 @@
-"""What the tests of the page share: messages of a pipeline, and a page that is served."""
+"""Fixtures of the tests of the pages: messages of a pipeline, and pages that are served."""
 
 import shutil
 import time
@@ -119,7 +119,7 @@ def serve_fleet(serve_site, fleet, manager):  # noqa: ARG001  # it answers
 
 @pytest.fixture
 def camera_at(rng):
-    """Makes pipelines that send pictures of frames: a function that is one turn of it."""
+    """Makes publishers of a pipeline: a function that sends the picture and the health report of the next frame."""
     image = cv2.imencode(".jpg", rng.integers(0, 255, (360, 640, 3), np.uint8))[1].tobytes()
     boxes, frame = {"anna": Box(4.0, 3.0, 200.0, 100.0)}, iter(range(1 << 30))
     with ExitStack() as stack:
@@ -142,5 +142,5 @@ def camera_at(rng):
 
 @pytest.fixture
 def camera(camera_at, endpoint):
-    """One turn of a pipeline in `folder` that sends pictures."""
+    """A function that sends the next picture of a pipeline in `folder`."""
     return camera_at(endpoint)

@@ -1,4 +1,4 @@
-"""The server of `catstream annotate`: its state, pictures of frames, changes, and what it rejects."""
+"""The server of `catstream annotate`: its state, pictures of frames, changes, and rejections."""
 
 import json
 

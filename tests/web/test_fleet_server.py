@@ -99,7 +99,7 @@ def test_pages_of_streams_are_closed_without_viewers(fleet, monkeypatch):
         first = pages.site("cam-1")
         with first.feed.viewed():
             assert pages.site("cam-2") is not first
-            third = pages.site("cam-3")  # in place of one that nobody looks at
+            third = pages.site("cam-3")  # replaces cam-2, which has no viewer
             assert pages.site("cam-1") is first
             with third.feed.viewed(), pytest.raises(HTTPException, match="too many"):
                 pages.site("cam-4")

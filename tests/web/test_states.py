@@ -1,4 +1,4 @@
-"""The page in each of its states, in a real browser: readable for all, and telling what is so."""
+"""The page in each of its states, in a real browser: accessible and correct."""
 
 import json
 import subprocess
@@ -20,7 +20,7 @@ SEVERAL = ("three objects", "another one chosen", "drawing one more", "forgettin
 
 @pytest.fixture
 def seen(script_of_browser, tmp_path):
-    """What `states.mjs` saw, by colour scheme and state."""
+    """The observations of `states.mjs`, by colour scheme and state."""
     cv2.imwrite(str(tmp_path / "picture.jpg"), np.full((240, 320, 3), (200, 160, 90), np.uint8))
     server = Server(Site(PipelineFeed(Address(str(tmp_path / "nowhere")))), port=0, token="correct-horse-battery")
     with server.in_background():
@@ -77,7 +77,7 @@ def check_another_pipeline(state):
 
 
 def check_end(before, last):
-    """The page keeps what it showed, and says that its server ended too."""
+    """The page shows its last content, and states that its server has ended."""
     assert before["overlay"] == "The end: the source has ended. This page waits for the next pipeline."
     assert last["overlay"].startswith("The end: the source has ended. The server of this page has ended too")
     assert (last["pill"], last["frame"], last["trees"]) == ("ended", before["frame"], before["trees"])

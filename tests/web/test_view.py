@@ -1,6 +1,6 @@
 """`catstream view`, `catstream fleet view` and `catstream track --view`, as a user starts them."""
 
-import encodings.idna  # noqa: F401  # used below as another user, who may not read this installation
+import encodings.idna  # noqa: F401  # imported before the user changes, who may not read this installation
 import json
 import os
 import re
@@ -70,7 +70,7 @@ def test_token_is_from_the_variable_or_the_file_of_the_user(tmp_path, monkeypatc
     file.chmod(0o644)
     assert token() != made[0], "others may have read it"
     monkeypatch.setenv("XDG_STATE_HOME", "/dev/null")
-    assert token() != token(), "it cannot be kept"
+    assert token() != token(), "it cannot be stored"
     assert token("none") is None
     assert token("from-a-variable-1") == "from-a-variable-1"
 
