@@ -6,10 +6,11 @@ import os
 import re
 import shutil
 import socket
+import ssl
 import subprocess
 import sys
 import threading
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import replace
 from socketserver import BaseRequestHandler, TCPServer
 
@@ -25,6 +26,7 @@ from catstream.wire.messages import Health, Track
 from catstream.wire.newest import Publisher
 
 MOSQUITTO = shutil.which("mosquitto", path=f"{os.environ['PATH']}:/usr/sbin")
+pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # by paho
 needs_broker = pytest.mark.skipif(MOSQUITTO is None, reason="no MQTT broker: apt-get install mosquitto")
 DOOR = {"door": ((0, 0), (100, 0), (100, 100), (0, 100))}
 ANNA = Track(0, 0.0, "present", Box(10, 20, 30, 40), 0.9, 1, object="anna")
@@ -33,27 +35,18 @@ ANNA = Track(0, 0.0, "present", Box(10, 20, 30, 40), 0.9, 1, object="anna")
 class Broker:
     """A broker with the user me, whose password is s/1; `start` and `stop` may be called again and again."""
 
-    def __init__(self, folder, until, *, tls=False):
+    def __init__(self, folder, until):
         with socket.socket() as free:
             free.bind(("127.0.0.1", 0))
             self.port = free.getsockname()[1]
         self._folder, self._until, self._process, self._stack = folder, until, None, ExitStack()
-        self.scheme = "mqtts" if tls else "mqtt"
-        self.url = f"{self.scheme}://me:s%2F1@localhost:{self.port}/yard/cam"
+        self.url = f"mqtt://me:s%2F1@localhost:{self.port}/yard/cam"
         (folder / "passwords").write_text("me:s/1\n")
         (folder / "passwords").chmod(0o600)
         subprocess.run(["mosquitto_passwd", "-U", folder / "passwords"], check=True)
         lines = [f"listener {self.port} localhost", "allow_anonymous false", f"password_file {folder / 'passwords'}"]
-        if tls:
-            self._make_certificate()
-            lines += [f"certfile {folder / 'crt'}", f"keyfile {folder / 'key'}"]
         user = "user root" if os.getuid() == 0 else ""
         (folder / "conf").write_text("\n".join([*lines, user, "persistence false", ""]))
-
-    def _make_certificate(self):
-        words = "req -x509 -newkey rsa:2048 -nodes -days 2 -subj /CN=localhost -addext subjectAltName=DNS:localhost"
-        subprocess.run(["openssl", *words.split(), "-keyout", "key", "-out", "crt"], cwd=self._folder, check=True,
-                       capture_output=True)  # fmt: skip
 
     def start(self):
         self._process = subprocess.Popen([MOSQUITTO, "-c", self._folder / "conf"], stderr=subprocess.DEVNULL)
@@ -74,8 +67,6 @@ class Broker:
         got, subscribed = {}, []
         client = mqtt.Client(mqtt.CallbackAPIVersion.VERSION2)
         client.username_pw_set("me", "s/1")
-        if self.scheme == "mqtts":
-            client.tls_set(self._folder / "crt")
         client.on_message = lambda _, __, it: got.setdefault(it.topic, []).append(it.payload.decode())
         client.on_subscribe = lambda *_: subscribed.append(True)
         client.connect("localhost", self.port)
@@ -101,9 +92,12 @@ def _patient(monkeypatch):
 
 
 @pytest.fixture
-def absent_broker(monkeypatch):
-    """Do not wait at the end for a broker that stays away."""
+def absent_broker(monkeypatch, until):
+    """Do not wait at the end for a broker that stays away; collect the sockets that paho does not close."""
     monkeypatch.setattr(mqtt_sink, "CLOSE_SECONDS", 0.1)
+    yield
+    until(lambda: not any(thread.name.startswith("paho") for thread in threading.enumerate()))
+    gc.collect()
 
 
 def opened(url, **options):
@@ -268,13 +262,15 @@ def test_silent_broker_blocks_nothing_and_misses_are_counted(monkeypatch, caplog
 
 
 @contextmanager
-def answering(reply):
+def answering(reply, tls=None):
     """A server that answers each connection with some bytes, and closes it; yields its port, and the connections."""
 
     class Handler(BaseRequestHandler):
         def handle(self):
-            connections.append(self.request.recv(1024))  # all: a reply before a reset would be lost
-            self.request.sendall(reply)
+            with suppress(OSError):
+                connection = tls.wrap_socket(self.request, server_side=True) if tls else self.request
+                connections.append(connection.recv(1024))  # all: a reply before a reset would be lost
+                connection.sendall(reply)
 
     connections = []
     with TCPServer(("127.0.0.1", 0), Handler) as server:
@@ -288,7 +284,6 @@ REFUSED = b"\x20\x02\x00\x05"  # an acknowledgement of MQTT 3.1.1: not authorize
 
 
 @pytest.mark.usefixtures("absent_broker")
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # paho does not close its sockets
 @pytest.mark.parametrize(
     ("scheme", "reply", "problem"),
     [
@@ -307,22 +302,18 @@ def test_server_that_is_no_broker_or_refuses_is_logged_once(scheme, reply, probl
     assert problem in message
 
 
-@needs_broker
+@pytest.mark.usefixtures("absent_broker")
 @pytest.mark.skipif(shutil.which("openssl") is None, reason="no certificate without it: apt-get install openssl")
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # paho does not close it
-def test_tls_needs_a_certificate_that_this_machine_trusts(tmp_path, until, monkeypatch, caplog):
-    broker = Broker(tmp_path, until, tls=True)
-    broker.start()
-    try:
-        with monkeypatch.context() as patch, opened(broker.url):
+def test_tls_connects_only_to_a_server_with_a_trusted_certificate(tmp_path, until, monkeypatch, caplog):
+    words = "req -x509 -newkey rsa:2048 -nodes -days 2 -subj /CN=localhost -addext subjectAltName=DNS:localhost"
+    files = ["-keyout", tmp_path / "key", "-out", tmp_path / "crt"]
+    subprocess.run(["openssl", *words.split(), *files], capture_output=True, check=True)
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context.load_cert_chain(tmp_path / "crt", tmp_path / "key")
+    with answering(REFUSED, context) as (port, connections):
+        with opened(f"mqtts://localhost:{port}/yard"):
             until(lambda: "certificate verify failed" in caplog.text)
-            patch.setattr(mqtt_sink, "CLOSE_SECONDS", 0.1)
-        until(lambda: not any(thread.name.startswith("paho") for thread in threading.enumerate()))
-        gc.collect()
-        got = broker.subscriber()
+        assert not connections
         monkeypatch.setenv("SSL_CERT_FILE", str(tmp_path / "crt"))
-        with opened(broker.url) as sink:
-            online(sink, until)
-        until(lambda: events(got)[-1:] == [("ended", 0.0)])
-    finally:
-        broker.stop()
+        with opened(f"mqtts://localhost:{port}/yard"):
+            until(lambda: connections)
