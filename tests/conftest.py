@@ -1,17 +1,16 @@
-"""Fixtures of all tests; those that one folder needs are in its own conftest.py.
+"""Fixtures of all tests; those of one folder are in its own conftest.py.
 
-They are layered, each on those before it:
-
-    data         rng, image, texture, scene: arrays; demo_video, walk, endless: files, rendered once for all workers
-    places       folder, endpoint, tcp, keys, disk: where the sockets, files and keys of one test are
+    data         rng, image, texture, scene: arrays; demo_video, walk, endless: files
+    endpoints    folder, endpoint, tcp, keys, disk: sockets, files and keys of one test
     peers        commanded, managing: a thread that answers as a detector, or as the registry of a fleet;
                  camera, walker: an HTTP server in this process
-    the command  said, succeed, fail: in this process; catstream, program: in a process of its own, killed afterwards;
-                 alive: whether a process runs
-    time         until, turning: wait for a condition; no test passes or fails by the time that something takes
+    the command  said, succeed, fail: in this process; catstream, program: in a process of its own, which is killed
+                 after the test; alive: whether a process runs
+    time         until, turning: wait for a condition. No test depends on a duration
 
-Only `catstream`, `program` and a `catstream.Pipeline` in a test start processes. `own_places` and `one_core` apply to
-all tests: no other pipeline of this user is found, and BLAS adds in the same order as in a pipeline.
+Only `catstream`, `program` and a `catstream.Pipeline` in a test start processes. Two fixtures apply to all tests:
+`own_folders` hides other pipelines of this user, and `one_core` makes BLAS add in the same order as in a pipeline.
+Fixtures have the scope "session" if they are functions without a state, or if their files take seconds to make.
 """
 
 import fcntl
@@ -74,9 +73,9 @@ def pytest_xdist_auto_num_workers():
 
 
 @pytest.fixture(scope="session", autouse=True)
-def own_places(tmp_path_factory):
-    """Folders of our own for what runs, is temporary, or is kept: no other pipeline of this user is found there."""
-    tmp_path_factory.getbasetemp()  # stays after the tests, to be looked at
+def own_folders(tmp_path_factory):
+    """Set the folders for sockets, temporary files and states: no other pipeline of this user is found there."""
+    tmp_path_factory.getbasetemp()  # remains after the tests
     with tempfile.TemporaryDirectory(prefix="cs-") as folder, pytest.MonkeyPatch.context() as patch:
         for name, variable in (("run", "XDG_RUNTIME_DIR"), ("tmp", "TMPDIR"), ("state", "XDG_STATE_HOME")):
             (Path(folder) / name).mkdir(mode=0o700)
@@ -87,7 +86,7 @@ def own_places(tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def once(tmp_path_factory):
-    """Gives the folder of a name, which is filled once for all workers."""
+    """Returns the folder of a name, which a function fills once for all workers."""
     base = tmp_path_factory.getbasetemp()
     shared = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
 
@@ -118,7 +117,7 @@ def demo_video(once):
 
 @pytest.fixture
 def endless(demo_video, tmp_path):
-    """A folder of so many images that no run reaches its end, all of the same frame."""
+    """A folder with 5000 images of the same frame: no run reaches its end."""
     folder = tmp_path / "endless"
     folder.mkdir()
     with open_source(demo_video(32)[0]) as source:
@@ -144,7 +143,7 @@ def walk(tmp_path_factory):
 
 @pytest.fixture(scope="session", autouse=True)
 def one_core():
-    """As in the pipeline: with more, BLAS adds in another order, and bits differ."""
+    """Limit BLAS to one thread, as in a pipeline: with more, the last bits of sums differ."""
     with one_thread():
         yield
 
@@ -204,7 +203,7 @@ def endpoint(folder):
 
 @pytest.fixture
 def keys(folder):
-    """A folder of keys; beside it those of a client, anna, who may watch."""
+    """A folder of keys; next to it are the keys of a client, anna, who may watch."""
     create(folder / "keys")
     allow(folder / "keys", "anna", "watch", output=folder / "anna")
     return folder / "keys"
@@ -228,14 +227,14 @@ def tcp():
 
 @pytest.fixture(scope="session")
 def until():
-    """Wait until a condition holds, turn after turn, and return what it returned; fail where it never does."""
+    """Waits until a condition is true, and returns its value; fails after five minutes."""
 
     def wait(condition, turn=lambda: time.sleep(0.01)):
         deadline = time.monotonic() + 300
-        while not (found := condition()):
-            assert time.monotonic() < deadline, "it did not happen in time"
+        while not (result := condition()):
+            assert time.monotonic() < deadline, "the condition did not become true"
             turn()
-        return found
+        return result
 
     return wait
 
@@ -261,7 +260,7 @@ def program():
 
 @pytest.fixture
 def catstream(program):
-    """Starts the command `catstream`; what still runs after the test is killed."""
+    """Starts the command `catstream`; its processes are killed after the test."""
     with ExitStack() as stack:
 
         def start(*arguments, **options):
@@ -276,7 +275,7 @@ def catstream(program):
 
 @pytest.fixture(scope="session")
 def said():
-    """Runs the command in this process, which imports nothing anew: exit code, output, errors."""
+    """Runs the command in this process, without the time of imports: exit code, output, errors."""
 
     def run(*arguments, cwd=None, env=None):
         errors = io.StringIO()
@@ -284,7 +283,7 @@ def said():
         warnings.setLevel(logging.WARNING)
         with (
             pytest.MonkeyPatch.context() as patch,
-            mock.patch.dict(os.environ, env or {}),  # the command sets variables, too
+            mock.patch.dict(os.environ, env or {}),  # restores the variables that the command sets
             tempfile.TemporaryFile("w+") as output,  # it has a descriptor
             redirect_stdout(output),
             redirect_stderr(errors),
@@ -355,13 +354,13 @@ def _turning(turn, pause=0.01):
 
 @pytest.fixture
 def turning():
-    """Calls a function again and again in a thread, with a pause of so many seconds before each call."""
+    """Calls a function repeatedly in a thread, with a pause in seconds before each call."""
     return _turning
 
 
 @pytest.fixture
 def managing():
-    """Serves the registry of a fleet of this status, or of what a function returns: its endpoint."""
+    """Serves the registry of a fleet with a status, or with the status that a function returns: its endpoint."""
 
     @contextmanager
     def manage(status, address="", keys=""):
@@ -374,18 +373,18 @@ def managing():
 
 @pytest.fixture
 def commanded():
-    """A detector that a test replaces: it answers each command, for example `stop` or `forget ben`; those that came."""
+    """A stand-in for the detector, which answers each command; the commands, for example `stop` or `forget ben`."""
 
     @contextmanager
     def answer(endpoint, answered=lambda command: (True, f"{command.verb} was done")):
         def turn():
             for command in responder.receive_all():
-                heard.append(f"{command.verb} {command.object}".strip())
+                commands.append(f"{command.verb} {command.object}".strip())
                 responder.answer(Answer(command.id, *answered(command)))
 
-        heard = []
+        commands = []
         with Responder[Command, Answer](CONTROL, endpoint) as responder, _turning(turn):
-            yield heard
+            yield commands
 
     return answer
 
@@ -411,7 +410,7 @@ def remount(disk):
 
 @pytest.fixture
 def fill(disk):
-    """Fills the disk: the file to remove."""
+    """Fills the disk, and returns the file that fills it."""
 
     def now():
         with (disk / "ballast").open("ab", buffering=0) as ballast, suppress(OSError):
@@ -424,7 +423,7 @@ def fill(disk):
 
 @pytest.fixture
 def full():
-    """Has the disk be full for a file that this process has open."""
+    """Makes each write to a file that this process has open fail as on a full disk."""
 
     def now(path):
         handles = [int(handle.name) for handle in Path("/proc/self/fd").iterdir() if handle.resolve() == path.resolve()]
@@ -476,7 +475,7 @@ class Camera:
                 time.sleep(0.025)
 
     def leave(self) -> None:
-        """Close all connections, and take no more."""
+        """Close all connections, and accept no more."""
         self._gone = True
         self._server.shutdown()
         self._server.server_close()
@@ -484,7 +483,7 @@ class Camera:
 
 @pytest.fixture
 def camera():
-    """Starts cameras that show `image(0)`, `image(1)` ...; on the port of an earlier one if wanted."""
+    """Starts cameras that show `image(0)`, `image(1)` ...; optionally on the port of an earlier one."""
     cameras: list[Camera] = []
 
     def start(image: Callable[[int], np.ndarray], port: int = 0) -> Camera:
@@ -492,13 +491,13 @@ def camera():
         return cameras[-1]
 
     yield start
-    for one in cameras:
-        one.leave()
+    for each in cameras:
+        each.leave()
 
 
 @pytest.fixture
 def walker():
-    """A camera before which a patch goes to and fro, and a function that finds its box in a JPEG of it."""
+    """The address of a camera with a patch that moves to and fro, and a function that finds its box in a JPEG."""
     rng = np.random.default_rng(4)
     field = np.kron(rng.integers(60, 200, (24, 32, 3), np.uint8), np.ones((10, 10, 1), np.uint8))
     patch = np.kron(rng.integers(0, 256, (5, 5, 3), np.uint8), np.ones((8, 8, 1), np.uint8))
@@ -510,9 +509,9 @@ def walker():
 
     def find(jpeg: bytes) -> Box:
         picture = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
-        _, _, _, place = cv2.minMaxLoc(cv2.matchTemplate(picture, patch, cv2.TM_CCOEFF_NORMED))
-        return Box(*map(float, place), 40.0, 40.0)
+        _, _, _, corner = cv2.minMaxLoc(cv2.matchTemplate(picture, patch, cv2.TM_CCOEFF_NORMED))
+        return Box(*map(float, corner), 40.0, 40.0)
 
-    one = Camera(image)
-    yield one.url, find
-    one.leave()
+    started = Camera(image)  # tests/web has another fixture `camera`
+    yield started.url, find
+    started.leave()

@@ -1,4 +1,4 @@
-"""What was learned of an object: made up, or from some frames of a video."""
+"""Learned states of an object: synthetic, or from frames of a video."""
 
 import numpy as np
 
@@ -22,12 +22,12 @@ def features(rng, appearance=1.0):
 
 
 def rows_of(tree):
-    """All rows that a coreset tree has in memory, C."""
+    """The rows of a coreset tree, C in the paper."""
     return np.vstack([*(node.rows for node in tree.nodes), tree.pending])
 
 
 def learned_from(video, box, part, settings=None):
-    """What a tracker learns in a part of a video, in whose first frame the object has this box."""
+    """The saved model of a tracker after a part of a video, with the box of the object in its first frame."""
     tracker = Tracker(settings)
     with open_source(video, part=part) as frames:
         for frame in frames:

@@ -1,4 +1,4 @@
-"""What the tests of the command line share."""
+"""Fixtures of the command line; they have the scope "session" because their runs take seconds."""
 
 import pytest
 
@@ -19,12 +19,12 @@ def long_video(demo_video):
 
 @pytest.fixture(scope="session")
 def whole_run(video, once, succeed):
-    """The folder of a run in lockstep that nothing disturbed.
+    """The folder of a run in lockstep without faults.
 
     out     its results, with a video
-    model   what it has learned
+    model   its saved model
     stdout  its tracks, as `--write -` prints them
-    stderr  what it told
+    stderr  its messages
     """
 
     def run(folder):
