@@ -36,10 +36,6 @@ def page(name: str) -> str:
     return (ROOT / name).read_text(encoding="utf-8")
 
 
-def everything() -> str:
-    return "\n".join(path.read_text(encoding="utf-8") for path in PAGES)
-
-
 def blocks(path: Path, language: str) -> list[str]:
     """Contents of the fenced blocks of a language."""
     return re.findall(rf"^```{language}\n(.*?)^```", path.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
@@ -63,18 +59,17 @@ def every_command() -> dict[str, click.Command]:
     return found
 
 
-def test_every_setting_and_preset_has_its_row_on_the_page_of_settings():
+def test_every_setting_and_preset_has_a_row_on_its_page():
     rows = hooks.settings()
     for name, setting in describe().items():
         assert f"| `{name}` |" in rows
-        assert setting.about, f"{name}: write what it means, in the docstring of its group"
-        assert setting.about.count(". ") >= 1, f"{name}: write when to change it"
+        assert setting.about.count(". ") >= 1, f"{name}: write its meaning and when to change it"
     assert all(f"| `{preset}` |" in rows for preset in PRESETS)
 
 
 def test_every_command_and_option_has_help_and_is_shown():
     """The page of the command line is made from the help when the documentation is built."""
-    shown = everything()
+    shown = "\n".join(path.read_text(encoding="utf-8") for path in PAGES)
     for words, command in every_command().items():
         assert command.help, f"{words}: write its docstring"
         for option in command.params:
@@ -82,6 +77,7 @@ def test_every_command_and_option_has_help_and_is_shown():
     for name in COMMANDS:
         assert re.search(rf"`{name}`|catstream {name}\b", page("README.md")), f"README.md: add {name}"
         assert re.search(rf"catstream {name}\b", shown), f"no page of docs/ shows `catstream {name}`"
+        assert "EXAMPLES" in (every_command()[name].help or ""), f"{name}: add an example to its docstring"
 
 
 def test_every_destination_and_format_of_tracks_is_explained():
@@ -150,31 +146,31 @@ RULES = {"links": wrong_links, "commands": wrong_commands, "names": wrong_names,
 
 
 @pytest.mark.parametrize("rule", RULES.values(), ids=RULES)
-def test_what_the_pages_name_exists(rule):
+def test_links_commands_and_names_on_pages_exist(rule):
     wrong = [f"{path.relative_to(ROOT)} {each}" for path in PAGES for each in rule(path)]
     assert not wrong, "\n".join(wrong)
 
 
 def printed_by(name: str, program: str) -> str:
-    """What a program of a page prints."""
+    """The output of a program of a page."""
     with contextlib.redirect_stdout(io.StringIO()) as printed:
         exec(compile(program, name, "exec"), {})
     return printed.getvalue()
 
 
-def test_the_tracker_of_the_tutorial_tracks(demo_video, tmp_path, monkeypatch):
+def test_tracker_of_the_tutorial_tracks(demo_video, tmp_path, monkeypatch):
     (tmp_path / "demo").symlink_to(demo_video(24)[0].parent)
     monkeypatch.chdir(tmp_path)
     program = "\n".join(block for block in blocks(DOCS / "tutorial.md", "python") if "tracker" in block)
     assert printed_by("tutorial.md", program).startswith("present")
 
 
-def test_the_examples_of_coreset_trees_summarise_a_stream():
+def test_examples_of_coreset_trees_run():
     program = "\n".join(blocks(DOCS / "coreset-trees.md", "python")).replace("1_000_000", "20_000")
     assert printed_by("coreset-trees.md", program).startswith("20000 rows in ")
 
 
-def test_the_version_is_the_same_everywhere_and_the_reference_has_all_public_names():
+def test_reference_has_the_version_and_all_public_names():
     assert tomllib.loads(page("pyproject.toml"))["project"]["version"] == catstream.__version__
     assert set(dir(catstream)) >= {*catstream.__all__, "__doc__"}, "before their first use"
     shown = set(re.findall(r"^::: catstream\.(\w+)", page("docs/api.md"), re.MULTILINE))

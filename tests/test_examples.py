@@ -1,4 +1,4 @@
-"""Each example runs once beside a real pipeline, or on a real video."""
+"""Each example runs once with a real pipeline, or on a real video."""
 
 import base64
 import json
@@ -41,8 +41,8 @@ def started(stack, example, *words):
 
 
 @pytest.fixture
-def beside(demo_video):
-    """Runs an example beside a pipeline; returns the tracks by frame, and the lines that the example printed."""
+def run_with_pipeline(demo_video):
+    """Runs an example with a pipeline; returns the tracks by frame, and the output lines of the example."""
 
     def run(example, *words, keys=""):
         source, boxes = demo_video(60)
@@ -61,11 +61,11 @@ def beside(demo_video):
 
 
 @pytest.mark.parametrize("example", ["subscriber.py", "subscriber.mjs"])
-def test_a_subscriber_prints_the_tracks_and_the_models_until_the_end(beside, keys, example):
+def test_subscriber_prints_tracks_and_models_until_the_end(run_with_pipeline, keys, example):
     modules = [EXAMPLES / "node_modules" / name for name in ("zeromq", "@msgpack/msgpack")]
     if example.endswith(".mjs") and not (shutil.which("node") and all(module.exists() for module in modules)):
         pytest.skip("Node.js or its modules are missing: npm ci --prefix examples")
-    found, printed = beside(example, "ENDPOINT", keys, keys=keys)
+    found, printed = run_with_pipeline(example, "ENDPOINT", keys, keys=keys)
     assert printed[-1] == "end: the source has ended, 0 tracks missed"
     tracks = [text.split() for text in printed if text.startswith("track ")]
     assert [int(frame) for _, frame, *_ in tracks] == list(range(60 - len(tracks), 60))
@@ -77,7 +77,7 @@ def test_a_subscriber_prints_the_tracks_and_the_models_until_the_end(beside, key
     assert any(text.startswith("model ") for text in printed)
 
 
-def test_the_example_of_several_objects_prints_when_two_meet_and_part(demo_video):
+def test_several_objects_prints_when_two_meet(demo_video):
     source, boxes = demo_video(60)
     sky = catstream.Box(boxes[0].x, boxes[0].y - 30, boxes[0].w, 40)  # the lower part of it is on the flower
     with ExitStack() as stack:
@@ -88,7 +88,7 @@ def test_the_example_of_several_objects_prints_when_two_meet_and_part(demo_video
     assert re.fullmatch(r"sky: present in \d+ of 60 frames", sky)
 
 
-def test_the_images_that_represent_a_folder_are_printed(demo_video, tmp_path):
+def test_summary_of_a_folder_prints_its_images(demo_video, tmp_path):
     with open_source(demo_video(24)[0]) as frames:
         for frame in frames:
             cv2.imwrite(str(tmp_path / f"{frame.number:02d}.png"), frame.image)
@@ -98,7 +98,7 @@ def test_the_images_that_represent_a_folder_are_printed(demo_video, tmp_path):
     assert "of the energy of all images is kept" in printed
 
 
-def test_tracks_become_detections_of_supervision():
+def test_tracks_are_converted_to_detections_of_supervision():
     pytest.importorskip("supervision")
     detections = runpy.run_path(str(EXAMPLES / "to_supervision.py"))["detections"]
     track = Track(0, 0.0, "present", catstream.Box(1, 2, 3, 4), 1.5, 0, object="anna")
@@ -107,7 +107,7 @@ def test_tracks_become_detections_of_supervision():
     assert len(detections([])) == 0
 
 
-def test_a_ground_station_selects_an_object_and_is_told_where_it_is(demo_video, monkeypatch):
+def test_ground_station_selects_an_object_and_receives_its_box(demo_video, monkeypatch):
     pytest.importorskip("pymavlink", reason="pymavlink is missing: pip install pymavlink")
     monkeypatch.setenv("MAVLINK20", "1")
     mavlink, mavutil = import_module("pymavlink.dialects.v20.common"), import_module("pymavlink.mavutil")
@@ -140,8 +140,8 @@ def test_a_ground_station_selects_an_object_and_is_told_where_it_is(demo_video, 
         assert "no longer tracked" in camera.communicate(timeout=500)[0]
 
 
-def test_the_zone_counter_counts_beside_a_run(beside):
-    _, printed = beside("zone_counter.py", "ENDPOINT", "all=0,0 320,0 320,240 0,240", "none=0,0 3,0 3,3")
+def test_zone_counter_counts_visits(run_with_pipeline):
+    _, printed = run_with_pipeline("zone_counter.py", "ENDPOINT", "all=0,0 320,0 320,240 0,240", "none=0,0 3,0 3,3")
     entered, left, everywhere, nowhere = printed
     assert entered.endswith("the object entered all, 1 inside")
     assert left.endswith("the object left all, 0 inside")
@@ -149,8 +149,10 @@ def test_the_zone_counter_counts_beside_a_run(beside):
     assert nowhere == "none: 0 visits, 0.0 s in all"
 
 
-def test_the_collector_stores_the_tracks_of_a_pipeline_although_another_is_missing(beside, tmp_path):
-    found, printed = beside("asyncio_collector.py", tmp_path / "tracks.sqlite", "ENDPOINT", "tcp://127.0.0.1")
+def test_collector_stores_tracks_if_another_pipeline_is_missing(run_with_pipeline, tmp_path):
+    found, printed = run_with_pipeline(
+        "asyncio_collector.py", tmp_path / "tracks.sqlite", "ENDPOINT", "tcp://127.0.0.1"
+    )
     with closing(sqlite3.connect(tmp_path / "tracks.sqlite")) as database:
         stored = {frame: rest for frame, *rest in database.execute("SELECT frame, state, score FROM tracks")}
     assert max(stored) == 59
@@ -158,7 +160,7 @@ def test_the_collector_stores_the_tracks_of_a_pipeline_although_another_is_missi
     assert "got 'tcp://127.0.0.1'" in "".join(printed)
 
 
-def test_the_cvat_function_tracks_a_shape_by_its_state(demo_video):
+def test_cvat_function_tracks_a_shape_by_its_state(demo_video):
     function = runpy.run_path(str(EXAMPLES / "cvat_function" / "main.py"))
     context = SimpleNamespace(user_data=SimpleNamespace(), Response=lambda **fields: SimpleNamespace(**fields))
     function["init_context"](context)

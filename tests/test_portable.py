@@ -1,4 +1,4 @@
-"""The half of the library that starts no pipeline uses nothing that only Linux has."""
+"""Commands and classes that start no pipeline run without the functions that only Linux has."""
 
 import subprocess
 import sys
@@ -9,7 +9,7 @@ import catstream
 from catstream.cli import load_command
 from catstream.errors import ServiceError
 
-#: Takes away what Windows or macOS lack, before anything is imported, and then runs this half.
+#: Removes the functions that Windows or macOS lack, before anything is imported, and then runs the commands.
 PROGRAM = """
 import ctypes, os, select, signal, socket, sys
 
@@ -77,7 +77,7 @@ if __name__ == "__main__":
 
 
 @pytest.mark.parametrize(("what", "folder"), [("annotate", "annotated"), ("find", ".")])
-def test_commands_run_without_what_only_linux_has(demo_video, walk, tmp_path, what, folder):
+def test_commands_run_without_functions_of_linux(demo_video, walk, tmp_path, what, folder):
     video, boxes = demo_video(12)
     (tmp_path / "program.py").write_text(PROGRAM)
     command = [sys.executable, tmp_path / "program.py", what, video, str(boxes[0]), str(boxes[-1]), walk]
@@ -87,7 +87,7 @@ def test_commands_run_without_what_only_linux_has(demo_video, walk, tmp_path, wh
 
 
 @pytest.mark.parametrize("system", ["win32", "darwin"])
-def test_a_pipeline_on_another_system_is_an_error_of_one_line(monkeypatch, system):
+def test_pipeline_on_another_system_is_an_error(monkeypatch, system):
     monkeypatch.setattr(sys, "platform", system)
     for start in (lambda: catstream.Pipeline, lambda: catstream.subscribe, lambda: load_command("track")):
         with pytest.raises(ServiceError, match="a pipeline requires Linux: use"):

@@ -1,4 +1,4 @@
-"""`catstream annotate`: the files that it writes, the frame that it asks for, and its errors."""
+"""`catstream annotate`: its files, the frame to check next, and its errors."""
 
 import csv
 import json
@@ -21,7 +21,7 @@ def rows(file):
         return list(csv.DictReader(table))
 
 
-def test_annotate_writes_the_log_and_its_tables_and_continues_from_its_boxes(demo, succeed, tmp_path):
+def test_annotation_continues_from_its_boxes(demo, succeed, tmp_path):
     video, boxes = demo
     out = tmp_path / "out"
     output, _ = succeed("annotate", video, "--box", f"anna@0={boxes[0]}", "--output", out, "--jobs", 1)
@@ -42,7 +42,7 @@ def test_annotate_writes_the_log_and_its_tables_and_continues_from_its_boxes(dem
     assert (first["checked"], first["doubtful"]) == ("keyframe", False)
 
 
-def test_output_of_a_running_annotation_is_refused_to_another_one(demo, fail, tmp_path):
+def test_output_of_a_running_annotation_is_locked(demo, fail, tmp_path):
     video, boxes = demo
     with locked_folder(tmp_path / "out"):
         error = fail("annotate", video, "--box", f"@0={boxes[0]}", "--output", tmp_path / "out", "--overwrite")
@@ -57,14 +57,14 @@ def test_output_of_a_running_annotation_is_refused_to_another_one(demo, fail, tm
         (["anna=1,2,30,40"], "expected NAME@FRAME=X,Y,W,H"),
     ],
 )
-def test_boxes_that_cannot_be_used_are_an_error_of_one_line(demo, fail, tmp_path, boxes, message):
+def test_invalid_boxes_are_an_error(demo, fail, tmp_path, boxes, message):
     options = [word for box in boxes for word in ("--box", box)]
     assert message in fail("annotate", demo[0], *options, "--output", tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize("options", [["--box", "@0=1,2,30,40"], []], ids=["boxes", "page"])
-def test_existing_results_are_replaced_with_overwrite_only(demo, fail, tmp_path, options):
+def test_existing_results_are_replaced_only_on_request(demo, fail, tmp_path, options):
     (tmp_path / "demo.ndjson").touch()
     assert "demo.ndjson exists already" in fail("annotate", demo[0], *options, "--output", tmp_path)
 

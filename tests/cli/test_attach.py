@@ -1,8 +1,9 @@
-"""`catstream watch` and `catstream status`, beside a pipeline that runs."""
+"""`catstream watch` and `catstream status` of a running pipeline."""
 
 import dataclasses
 import json
 import os
+import re
 import select
 import signal
 
@@ -14,9 +15,7 @@ from catstream.pipeline import Pipeline
 from catstream.processes.start_server import NAMES
 from catstream.wire.messages import Health, Track
 
-SECONDS = 500  # that anything may take on a busy machine
-
-
+SECONDS = 500  # timeout on a busy machine
 #: A pipeline continues only if its tracks are received.
 SETTINGS = {"run.unstored_frames": 1}
 
@@ -31,7 +30,7 @@ def resting(video):
         yield running
 
 
-def test_watch_prints_tracks_as_json_lines_until_the_end_and_features_as_lines(long_video, catstream):
+def test_watch_prints_tracks_and_features_until_the_end(long_video, catstream):
     with Pipeline(*long_video, SETTINGS) as running:
         place = ["--endpoint", running.endpoint]
         features = catstream("watch", "features", "--count", 3, *place)
@@ -53,7 +52,7 @@ def test_watch_prints_tracks_as_json_lines_until_the_end_and_features_as_lines(l
     assert (tracks.returncode, features.returncode) == (0, 0)
 
 
-def test_late_subscriber_gets_the_last_model_with_its_arrays_described(resting, said):
+def test_watch_describes_the_arrays_of_the_last_model(resting, said):
     code, output, errors = said("watch", "models", "--count", 1, "--json", "--endpoint", resting.endpoint)
     model = json.loads(output)
     assert model["version"] >= 1
@@ -62,18 +61,12 @@ def test_late_subscriber_gets_the_last_model_with_its_arrays_described(resting, 
     assert (code, errors) == (0, "1 message, 0 missed\n")
 
 
-def test_ctrl_c_is_no_error(resting, catstream):
+def test_ctrl_c_ends_watch_without_an_error(resting, catstream):
     process = catstream("watch", "health", "--endpoint", resting.endpoint)
     assert process.stdout.readline()
     process.send_signal(signal.SIGINT)
     _, errors = process.communicate(timeout=SECONDS)
     assert (process.returncode, "Traceback" in errors) == (0, False)
-
-
-def test_silent_endpoint_is_one_line_of_error(fail, tmp_path):
-    error = fail("watch", "tracks", "--endpoint", tmp_path, "--wait", 0.2)
-    assert error.startswith(f"catstream: no health arrived from {tmp_path} within 0.2 s: is a pipeline running there?")
-    assert error.endswith("It has no sockets: if it runs, they were removed; start it again.")
 
 
 def test_status_shows_all_processes(resting, said, until):
@@ -97,10 +90,11 @@ def test_status_fails_and_names_a_silent_process(resting, said):
         os.kill(resting.pids["trainer"], signal.SIGCONT)
     assert code == 1
     assert "trainer" not in output
-    assert errors == f"catstream: no health report at {resting.endpoint} within 3 s from: trainer\n"
+    # On a busy machine, other processes may be late too.
+    assert re.fullmatch(r"catstream: no health report at .* within 3 s from: .*trainer(:.*)?\n", errors)
 
 
-def test_lines_of_status_depend_on_the_source_and_the_trees():
+def test_lines_of_status_depend_on_the_reports():
     counters = {"sent": 9.0, "processed": 9.0, "stored": 9.0, "skipped": 2.0, "model_version": 3.0}
     status = Status("run", processes={"detector": Health("detector", 1.0, counters)})
     status.processes["compressor"] = Health("compressor", 1.0, {"frames": 1.0})

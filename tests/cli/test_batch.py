@@ -1,4 +1,4 @@
-"""`catstream batch`: the logs of many videos, what is not tracked again, and one data set of all."""
+"""`catstream batch`: the logs of many videos, repeated runs, and a data set of all."""
 
 import csv
 import signal
@@ -38,26 +38,29 @@ def summaries(folder):
 
 @pytest.fixture
 def batch(said, tmp_path):
-    """Runs a batch with results in out: its exit status, and the rows of batch.csv."""
+    """Runs a batch with results in out: its exit status, its messages, and the rows of batch.csv."""
 
     def run(*rows):
-        code, *_ = said("batch", table(tmp_path, *rows), "--output", tmp_path / "out", "--jobs", 1)
-        return code, summaries(tmp_path / "out")
+        code, _, errors = said("batch", table(tmp_path, *rows), "--output", tmp_path / "out", "--jobs", 1)
+        return code, errors, summaries(tmp_path / "out")
 
     return run
 
 
-def test_a_video_that_fails_does_not_stop_the_others(demo, batch, tmp_path):
+def test_failed_video_does_not_stop_the_others(demo, batch, tmp_path):
     boxes = f"broken.mp4,,{demo[0]},", f"two/cam.mp4,anna,{demo[0]},", f"two/cam.mp4,ben,{demo[2]},2"
-    code, rows = batch(*boxes)
+    code, errors, rows = batch(*boxes)
     assert code == 1
     assert "not a video that can be read" in rows["broken.mp4"]["error"]
     assert (rows["two/cam.mp4"]["frames"], rows["two/cam.mp4"]["tracks"]) == ("12", "22")
     files = {path.name for path in (tmp_path / "out").iterdir()}
     assert files == {"batch.csv", "two_cam.csv", "two_cam.ndjson"}
+    assert errors.startswith("tracking 2 videos, 0 complete\n")
+    assert "\n1 of 2 (50%), " in errors
+    assert "2 of 2 (100%), 0:00:00 left: two/cam.mp4: 12 frames, 100% present\n" in errors
 
 
-def test_an_object_with_one_box_is_tracked_as_by_a_tracker_from_its_frame_on(demo, batch, tmp_path):
+def test_batch_equals_a_tracker_from_the_frame_of_the_box(demo, batch, tmp_path):
     batch(f"two/cam.mp4,anna,{demo[3]},3")
     log = Log(tmp_path / "out" / "two_cam.ndjson")
     tracker, expected = MultiTracker(), []
@@ -72,26 +75,28 @@ def test_an_object_with_one_box_is_tracked_as_by_a_tracker_from_its_frame_on(dem
     assert (log.header().start, log.header().source) == (3, str(tmp_path / "two" / "cam.mp4"))
 
 
-def test_only_videos_that_failed_or_have_other_boxes_are_tracked_again(demo, batch, demo_video, tmp_path):
+def test_only_failed_or_changed_videos_are_tracked_again(demo, batch, demo_video, tmp_path):
     boxes, log = [f"broken.mp4,,{demo[0]},", f"two/cam.mp4,anna,{demo[0]},"], tmp_path / "out" / "two_cam.ndjson"
     batch(*boxes)
     first = log.stat().st_mtime_ns
     (tmp_path / "broken.mp4").write_bytes(demo_video(FRAMES)[0].read_bytes())
-    code, rows = batch(*boxes)
+    code, _, rows = batch(*boxes)
     assert (code, log.stat().st_mtime_ns) == (0, first)
     assert not any(row["error"] for row in rows.values())
 
-    code, rows = batch(boxes[1], f"two/cam.mp4,anna,{demo[-1]},{FRAMES - 1}")
+    _, _, rows = batch(boxes[1], f"two/cam.mp4,anna,{demo[-1]},{FRAMES - 1}")
     assert log.stat().st_mtime_ns != first
     assert rows["two/cam.mp4"]["checked"] == str(FRAMES)
 
 
-def test_results_of_another_table_are_not_replaced_and_its_rows_stay(demo, batch, succeed, fail, demo_video, tmp_path):
+def test_results_of_another_table_are_not_replaced(demo, batch, succeed, fail, demo_video, tmp_path):
     batch(f"two/cam.mp4,anna,{demo[0]},")
     (tmp_path / "three" / "two").mkdir(parents=True)
     for name in ("cam.mp4", "side.mp4"):
         (tmp_path / "three" / "two" / name).write_bytes(demo_video(FRAMES)[0].read_bytes())
     words = ["--output", tmp_path / "out", "--jobs", 1]
+    (tmp_path / "two_cam.ndjson").touch()
+    assert "two_cam.ndjson exists already" in fail("batch", tmp_path / "boxes.csv", "--output", tmp_path)
     other = table(tmp_path / "three", f"two/cam.mp4,anna,{demo[0]},")
     assert f"two_cam.ndjson is the log of {tmp_path}/two/cam.mp4, not of" in fail("batch", other, *words)
     succeed("batch", table(tmp_path / "three", f"two/side.mp4,anna,{demo[0]},"), *words)
@@ -101,7 +106,7 @@ def test_results_of_another_table_are_not_replaced_and_its_rows_stay(demo, batch
     assert Log(tmp_path / "out" / "two_cam.ndjson").header().source == f"{tmp_path}/three/two/cam.mp4"
 
 
-def test_an_object_with_one_box_has_the_same_tracks_beside_one_with_several(demo, batch, tmp_path):
+def test_tracks_do_not_depend_on_other_objects(demo, batch, tmp_path):
     def ben(*others):
         batch(*others, f"two/cam.mp4,ben,{demo[3]},3")
         tracks = (track for frame in Log(tmp_path / "out" / "two_cam.ndjson") for track in frame.tracks)
@@ -112,25 +117,11 @@ def test_an_object_with_one_box_has_the_same_tracks_beside_one_with_several(demo
     assert ben(f"two/cam.mp4,anna,{demo[0]},", f"two/cam.mp4,anna,{demo[-1]},{FRAMES - 1}") == alone
 
 
-def test_a_line_for_each_video_that_has_ended_is_printed_without_a_terminal(demo, said, tmp_path):
-    boxes = table(tmp_path, f"broken.mp4,,{demo[0]},", f"two/cam.mp4,anna,{demo[0]},")
-    _, _, errors = said("batch", boxes, "--output", tmp_path / "out", "--jobs", 1)
-    assert errors.startswith("tracking 2 videos, 0 complete\n1 of 2 (50%), 0:0")
-    assert "2 of 2 (100%), 0:00:00 left: two/cam.mp4: 12 frames, 100% present\n" in errors
-
-
-def test_only_the_suffix_of_a_file_is_no_part_of_the_name_of_its_results(tmp_path):
+def test_results_are_named_by_the_file_without_its_suffix(tmp_path):
     for folder in ("seq.01", "seq.02"):
         (tmp_path / folder).mkdir()
     boxes = table(tmp_path, *(f"{name},,1,2,30,40,0" for name in ("seq.01", "./seq.02", "a/cam.2.mp4")))
     assert [video.name for video in read_videos(boxes)] == ["seq.01", "seq.02", "a_cam.2"]
-
-
-def test_existing_logs_of_something_else_are_not_replaced(demo, fail, tmp_path):
-    (tmp_path / "two_cam.ndjson").touch()
-    boxes = table(tmp_path, f"two/cam.mp4,anna,{demo[0]},")
-    assert "two_cam.ndjson exists already" in fail("batch", boxes, "--output", tmp_path)
-    assert not (tmp_path / "batch.csv").exists()
 
 
 @pytest.mark.parametrize(
@@ -143,7 +134,7 @@ def test_existing_logs_of_something_else_are_not_replaced(demo, fail, tmp_path):
         (["a/b.mp4,,1,2,30,40,0", "a_b.avi,,1,2,30,40,0"], "several videos would have the results a_b"),
     ],
 )
-def test_a_table_that_cannot_be_used_is_an_error_of_one_line(fail, tmp_path, rows, message):
+def test_invalid_table_is_an_error(fail, tmp_path, rows, message):
     assert message in fail("batch", table(tmp_path, *rows), "--output", tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
@@ -156,13 +147,13 @@ def test_a_table_that_cannot_be_used_is_an_error_of_one_line(fail, tmp_path, row
         ("10,10,20,20,99", "ben: frame 99 is outside the video: pass a frame from 0 to 11"),
     ],
 )
-def test_a_box_that_cannot_be_tracked_is_the_error_of_its_video(demo, batch, row, message):
-    code, rows = batch(f"two/cam.mp4,anna,{demo[0]},0", f"two/cam.mp4,ben,{row}")
+def test_invalid_box_is_an_error_of_its_video(demo, batch, row, message):
+    code, _, rows = batch(f"two/cam.mp4,anna,{demo[0]},0", f"two/cam.mp4,ben,{row}")
     assert code == 1
     assert rows["two/cam.mp4"]["error"].startswith(message)
 
 
-def test_the_logs_of_a_batch_become_one_data_set(demo, succeed, fail, demo_video, tmp_path):
+def test_logs_of_a_batch_become_one_data_set(demo, succeed, fail, demo_video, tmp_path):
     (tmp_path / "cam.mp4").write_bytes(demo_video(FRAMES)[0].read_bytes())
     boxes = table(tmp_path, f"cam.mp4,ben,{demo[0]},", f"two/cam.mp4,anna,{demo[0]},")
     succeed("batch", boxes, "--output", tmp_path / "out", "--jobs", 1)
@@ -176,7 +167,7 @@ def test_the_logs_of_a_batch_become_one_data_set(demo, succeed, fail, demo_video
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT])
-def test_a_batch_is_completed_after_a_worker_was_killed_or_ctrl_c(demo_video, catstream, until, tmp_path, number):
+def test_batch_completes_after_a_killed_worker_or_ctrl_c(demo_video, catstream, until, tmp_path, number):
     video, boxes = demo_video(60)
     for name in "ab":
         (tmp_path / f"{name}.mp4").write_bytes(video.read_bytes())

@@ -1,4 +1,4 @@
-"""What the commands share: the progress line and the summary of a run, and Ctrl-C between frames and within one."""
+"""The progress line and the summary of a run, and signals."""
 
 import io
 import os
@@ -20,7 +20,7 @@ from catstream.wire.messages import Track
 SIGNALS = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
 
 
-def counted(seen, **pipeline):
+def progress_of(seen, **pipeline):
     """The progress of a run after the tracks of some frames."""
     run = {"lost_seconds": 0, "holding": "", "totals": {}, "restarts": 0, "results": Results()}
     progress = RunProgress(SimpleNamespace(**run, **pipeline))
@@ -29,27 +29,27 @@ def counted(seen, **pipeline):
     return progress
 
 
-def test_progress_without_a_terminal_is_a_line_now_and_then(monkeypatch):
+def test_progress_without_a_terminal_is_a_line_at_times(monkeypatch):
     screen = Console(file=io.StringIO())
     with line_of(screen) as progress:
         task = progress.add_task("reading", total=3)
         progress.update(task, advance=1)
         monkeypatch.setattr(common, "LINE_SECONDS", -1.0)
         progress.update(task, advance=1)
-    assert screen.file.getvalue().split() == ["reading", "2/3", "-:--:--"]
+    assert screen.file.getvalue().split()[:2] == ["reading", "2/3"]
 
 
 @pytest.mark.parametrize("live", [False, True], ids=["file", "live"])
-def test_line_begins_with_the_state_and_the_frames(live):
+def test_progress_line_has_the_state_and_the_frames(live):
     health = {"detector": {"skipped": 1234.0}, "compressor": {"leaves": 456.0}}
     track = Track(0, 0.0, "bootstrapping", None, -12.25, 12345)
-    line = counted([{"": track}], live=live, frames=None if live else 30000, health=health).line()
+    line = progress_of([{"": track}], live=live, frames=None if live else 30000, health=health).line()
     assert line.startswith("bootstrapping 1  " if live else "bootstrapping 1/30000  ")
     assert line.endswith(f"{'  1234 skipped' * live}  score -12.25  model 12345  456 leaves")
 
 
-def test_line_says_why_no_frame_is_tracked():
-    progress = counted([], live=True, frames=None, health={})
+def test_progress_line_has_the_reason_without_tracks():
+    progress = progress_of([], live=True, frames=None, health={})
     assert progress.line() == "starting"
     progress._pipeline.holding = "paused"
     assert progress.line() == "paused"
@@ -57,10 +57,10 @@ def test_line_says_why_no_frame_is_tracked():
     assert progress.line() == "lost 12 s"
 
 
-def test_of_several_objects_the_line_has_the_scores_and_the_summary_a_line_for_each():
+def test_progress_of_several_objects_lists_each():
     anna = [Track(0, 0.0, "present", box, 0.9, 7, object="anna") for box in (Box(1, 2, 30, 40), None)]
     ben = Track(0, 0.0, "absent", None, 0.1, 4, object="ben")
-    progress = counted([{"anna": each, "ben": ben} for each in anna[::-1]], live=False, frames=9, health={})
+    progress = progress_of([{"anna": each, "ben": ben} for each in anna[::-1]], live=False, frames=9, health={})
     assert progress.line().startswith("1/2 present   2/9")
     assert "anna +0.90  ben +0.10" in progress.line()
     assert progress.summary().splitlines()[1:] == [
@@ -98,7 +98,7 @@ def test_signal_takes_effect_after_the_current_frame(interrupts, number):
     assert results == video == [0, 1, 2, 3]
 
 
-def test_during_imports_a_signal_ends_the_process_at_once(interrupts, monkeypatch, capfd):
+def test_signal_during_imports_ends_the_process_at_once(interrupts, monkeypatch, capfd):
     monkeypatch.setattr(os, "_exit", sys.exit)
     with pytest.raises(SystemExit, match="130"), interrupts.leaving():
         signal.raise_signal(signal.SIGINT)

@@ -1,4 +1,4 @@
-"""No file in the current folder is run, whichever command is started there."""
+"""No command imports a file of the current folder."""
 
 import subprocess
 import sys

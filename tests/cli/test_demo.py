@@ -5,7 +5,7 @@ import re
 from catstream.video.source import open_source
 
 
-def test_the_demo_is_followed_and_shown(succeed, tmp_path):
+def test_demo_is_tracked_and_annotated(succeed, tmp_path):
     output, _ = succeed("demo", "--output", tmp_path, "--frames", 25)
     success = re.search(r"success rate: ([\d.]+)", output)
     assert success
@@ -19,5 +19,5 @@ def test_render_only_starts_no_pipeline(succeed, tmp_path):
     assert sorted(file.name for file in tmp_path.iterdir()) == ["demo.mp4", "groundtruth_rect.txt"]
 
 
-def test_the_box_of_a_live_demo_is_printed(succeed):
+def test_box_of_a_live_demo_is_printed(succeed):
     assert succeed("demo", "--live", "demo:1") == ("184,88,57,58\n", "")

@@ -14,7 +14,7 @@ from catstream.output.destinations import Header
 from catstream.wire.messages import Track
 
 
-def test_other_formats_are_made_from_the_log_of_a_run(whole_run, video, succeed, fail, tmp_path):
+def test_log_of_a_run_is_exported_to_other_formats(whole_run, video, succeed, fail, tmp_path):
     log = whole_run / "out" / "demo.csv"
     succeed("export", whole_run / "out" / "demo.ndjson", tmp_path / "t.sqlite")
     with closing(sqlite3.connect(tmp_path / "t.sqlite")) as database:
@@ -28,7 +28,7 @@ def test_other_formats_are_made_from_the_log_of_a_run(whole_run, video, succeed,
     assert "t.sqlite exists already: replace it with --overwrite" in fail("export", log, tmp_path / "t.sqlite")
 
 
-def test_the_labels_of_a_data_set_are_replaced_only_on_request(whole_run, succeed, fail, tmp_path):
+def test_labels_of_a_data_set_are_replaced_only_on_request(whole_run, succeed, fail, tmp_path):
     command = ["export", whole_run / "out" / "demo.ndjson", tmp_path / "set", "--format", "yolo"]
     succeed(*command)
     label, other = (tmp_path / "set" / "labels" / name for name in ("demo_000000.txt", "other.txt"))
@@ -44,31 +44,30 @@ def test_the_labels_of_a_data_set_are_replaced_only_on_request(whole_run, succee
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (["--classes", "a,a"], "expected different names"),
         (["--classes", "a,,b"], "expected different names"),
         (["--label", "a\x01b"], "expected printable characters"),
         (["--format", "mot", "--classes", "a"], "--classes requires a format with classes"),
         (["--images"], "--images requires --format yolo"),
     ],
 )
-def test_options_of_an_export_that_contradict_each_other_are_an_error(whole_run, fail, tmp_path, options, words):
+def test_invalid_options_of_an_export_are_an_error(whole_run, fail, tmp_path, options, words):
     assert words in fail("export", whole_run / "out" / "demo.ndjson", tmp_path / "t.xml", *options)
     assert not (tmp_path / "t.xml").exists()
 
 
-def test_the_images_of_a_data_set_are_those_of_the_tracked_frames(whole_run, succeed, tmp_path):
+def test_data_set_has_the_images_of_the_tracked_frames(whole_run, succeed, tmp_path):
     succeed("export", whole_run / "out" / "demo.ndjson", tmp_path / "set", "--format", "yolo", "--images")
     images, labels = (sorted((tmp_path / "set" / name).iterdir()) for name in ("images", "labels"))
     assert [file.stem for file in images] == [file.stem for file in labels]
     assert (len(images), cv2.imread(str(images[0])).shape) == (32, (240, 320, 3))
 
 
-def test_a_source_with_frames_of_another_size_is_an_error(whole_run, fail, tmp_path):
+def test_source_of_another_size_is_an_error(whole_run, fail, tmp_path):
     log, annotated = whole_run / "out" / "demo.ndjson", whole_run / "out" / "demo.mp4"
     assert "has frames of (320, 240), not" in fail("export", log, tmp_path / "t.json", "--source", annotated)
 
 
-def test_images_of_several_folders_with_the_same_names_are_all_in_the_data_set(walk, succeed, tmp_path):
+def test_images_of_equal_names_are_all_in_the_data_set(walk, succeed, tmp_path):
     for name in ("monday", "tuesday"):
         shutil.copytree(walk / "img", tmp_path / name)
         track = Track(0, 0.0, "present", Box(10, 20, 30, 40), 0.9, 1, object="anna")

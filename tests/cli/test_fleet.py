@@ -10,7 +10,7 @@ from catstream.cli.fleet_commands import _down
 from catstream.fleet import fleet
 
 
-def test_the_end_of_a_fleet_is_an_error_if_the_last_state_of_a_stream_is_not_stored(capsys):
+def test_fleet_that_loses_a_state_at_its_end_is_an_error(capsys):
     _down(SimpleNamespace(name="site", down=list))
     with pytest.raises(SystemExit) as ended:
         _down(SimpleNamespace(name="site", down=lambda: ["gate: the store is full"]))
@@ -21,7 +21,7 @@ def test_the_end_of_a_fleet_is_an_error_if_the_last_state_of_a_stream_is_not_sto
 
 
 @pytest.mark.parametrize("command", ["up", "down"])
-def test_without_a_home_directory_a_fleet_is_an_error_of_one_line(command, fail, tmp_path, monkeypatch):
+def test_fleet_without_a_home_directory_is_an_error(command, fail, tmp_path, monkeypatch):
     file = tmp_path / "fleet.toml"
     file.write_text('[streams.one]\nsource = "demo:1"\n')
     for name in ("HOME", "XDG_STATE_HOME", "RAY_ADDRESS"):
@@ -30,7 +30,7 @@ def test_without_a_home_directory_a_fleet_is_an_error_of_one_line(command, fail,
     assert "set HOME or XDG_STATE_HOME" in fail("fleet", command, *([file] if command == "up" else []))
 
 
-def test_a_stream_that_is_added_is_as_one_of_the_file(succeed, tmp_path, monkeypatch):
+def test_added_stream_has_the_options_of_the_command(succeed, tmp_path, monkeypatch):
     added = []
     site = SimpleNamespace(add=lambda spec: [added.append(spec)] and ["gate: is added"])
     monkeypatch.setattr(fleet, "Fleet", lambda *_, **__: nullcontext(site))

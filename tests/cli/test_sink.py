@@ -1,4 +1,4 @@
-"""`catstream sink`, beside a pipeline that runs, and `catstream export` of what it has written."""
+"""`catstream sink`: the files that it writes of a running pipeline."""
 
 import json
 import select
@@ -17,7 +17,7 @@ from catstream.wire.newest import Publisher
 FILES = ["tracks.ndjson", "t.csv", "walk.mp4"]
 
 
-def test_tracks_are_written_to_files_and_stay_there(long_video, catstream, tmp_path):
+def test_sink_writes_files_until_the_end_or_ctrl_c(long_video, catstream, tmp_path):
     whole, stopped = tmp_path / "whole", tmp_path / "stopped"
     with Pipeline(*long_video, {"run.unstored_frames": 1}) as pipeline:
         sinks = {}
@@ -57,9 +57,7 @@ def written(folder, errors):
     return frames
 
 
-def test_repeated_frames_after_a_restart_are_skipped_and_another_run_ends_the_sink(
-    catstream, endpoint, tmp_path, until
-):
+def test_sink_skips_repeated_frames_and_ends_at_another_run(catstream, endpoint, tmp_path, until):
     file = tmp_path / "tracks.ndjson"
     with Publisher(HEALTH, endpoint, "detector") as health:
         sink = catstream("sink", file, "--endpoint", endpoint)
@@ -81,7 +79,7 @@ def test_repeated_frames_after_a_restart_are_skipped_and_another_run_ends_the_si
     assert "310 tracks, 0 missed: the run had no end, and another one started" in errors
 
 
-def test_a_sink_that_starts_again_keeps_the_file_of_its_last_start(catstream, endpoint, tmp_path, until):
+def test_restarted_sink_renames_its_earlier_file(catstream, endpoint, tmp_path, until):
     file = tmp_path / "tracks.ndjson"
     file.write_text("of the last start\n")
     with Publisher(HEALTH, endpoint, "detector") as health:
@@ -94,9 +92,3 @@ def test_a_sink_that_starts_again_keeps_the_file_of_its_last_start(catstream, en
         sink.communicate(timeout=500)
     old, new = sorted(tmp_path.glob("*.ndjson"))
     assert (old.read_text(), new, new.read_text().count("\n")) == ("of the last start\n", file, 1)
-
-
-def test_without_a_pipeline_no_file_is_left(fail, tmp_path):
-    error = fail("sink", tmp_path / "tracks.csv", "--endpoint", tmp_path, "--wait", 1)
-    assert "is a pipeline running there?" in error
-    assert not (tmp_path / "tracks.csv").exists()

@@ -1,4 +1,4 @@
-"""`catstream track`, as a person runs it."""
+"""`catstream track` of videos: its results, and its errors."""
 
 import csv
 import errno
@@ -37,7 +37,7 @@ def frames_of(folder, name="demo"):
     return [frame.number for frame in Log(folder / f"{name}.ndjson")]
 
 
-def test_it_writes_a_log_in_two_forms_and_a_video(whole_run):
+def test_track_writes_a_log_in_two_forms_and_a_video(whole_run):
     out = whole_run / "out"
     assert "32 messages sent, 32 stored" in (whole_run / "stderr").read_text()
     assert sorted(file.name for file in out.iterdir()) == FILES
@@ -53,7 +53,7 @@ def test_it_writes_a_log_in_two_forms_and_a_video(whole_run):
         assert sum(1 for _ in film) == 32
 
 
-def test_a_part_has_a_row_for_each_frame_that_was_followed(video, succeed, tmp_path):
+def test_part_has_a_row_for_each_tracked_frame(video, succeed, tmp_path):
     source, box = video
     part, out = ["--start", "4", "--end", "32", "--stride", "4"], tmp_path / "[red]a[b]"
     _, errors = succeed("track", source, "--box", box, *part, "--output", out)
@@ -65,7 +65,7 @@ def test_a_part_has_a_row_for_each_frame_that_was_followed(video, succeed, tmp_p
     assert header.boxes == {"": Box.parse(box)}
 
 
-def test_the_object_of_a_saved_model_is_found(whole_run, video, succeed, tmp_path):
+def test_object_of_a_saved_model_is_found(whole_run, video, succeed, tmp_path):
     succeed("track", video[0], "--model", whole_run / "model", "--output", tmp_path)
     rows = table(tmp_path / "demo.csv")
     assert [row["state"] for row in rows[3:]] == ["present"] * 29  # each frame is searched for one of three sizes
@@ -84,7 +84,7 @@ def test_two_lockstep_runs_write_the_same_bytes(video, whole_run, succeed, tmp_p
     assert SavedModel.load(tmp_path / "model").model.version >= newest > 2
 
 
-def test_a_reader_that_wants_no_more_ends_the_run_in_silence(video, catstream):
+def test_closed_pipe_ends_the_run_silently(video, catstream):
     source, box = video
     process = catstream("track", source, "--box", box, "--write", "-")
     assert json.loads(process.stdout.readline())["frame"] == 0
@@ -94,22 +94,21 @@ def test_a_reader_that_wants_no_more_ends_the_run_in_silence(video, catstream):
     assert process.wait(500) == 1
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])  # test_track_live.py has SIGINT
-def test_a_stopped_run_keeps_its_results(long_video, said, until, tmp_path, number):
+def test_terminated_run_keeps_its_results(long_video, said, until, tmp_path):
     source, box = long_video  # it is not over before the signal comes
     more = ["--video", "--save-model", tmp_path / "model", "--set", "run.unstored_frames=1", "--lockstep"]
 
     def stop():
         until(lambda: len(frames_of(tmp_path)) > 8)
         found = running()
-        os.kill(os.getpid(), number)
+        os.kill(os.getpid(), signal.SIGTERM)
         return found
 
-    with ExitStack() as stack:
-        stack.callback(signal.signal, number, signal.signal(number, lambda *_: None))  # it is not ignored
+    with ExitStack() as stack:  # in which SIGTERM is not ignored
+        stack.callback(signal.signal, signal.SIGTERM, signal.signal(signal.SIGTERM, lambda *_: None))
         children = stack.enter_context(ThreadPoolExecutor(1)).submit(stop)
         code, _, errors = said("track", source, "--box", box, "--output", tmp_path, *more)
-    assert code == 128 + number
+    assert code == 128 + signal.SIGTERM
     assert "the results so far are kept" in errors
     rows = frames_of(tmp_path)
     assert rows == list(range(len(rows)))
@@ -144,7 +143,7 @@ REJECTED = {
 
 
 @pytest.mark.parametrize(("arguments", "word"), REJECTED.values(), ids=REJECTED)
-def test_bad_input_is_rejected_in_one_line_and_nothing_is_written(video, fail, tmp_path, arguments, word):
+def test_invalid_input_is_an_error_and_nothing_is_written(video, fail, tmp_path, arguments, word):
     source, box = video
     (tmp_path / "notes.txt").write_text("not a video\n")
     given = arguments if not arguments[0].startswith("--") else [source, *arguments]
@@ -154,7 +153,7 @@ def test_bad_input_is_rejected_in_one_line_and_nothing_is_written(video, fail, t
     assert [file.name for file in tmp_path.iterdir()] == ["notes.txt"]
 
 
-def test_a_port_of_the_page_that_is_in_use_is_an_error_before_the_run(video, fail, tmp_path):
+def test_used_port_of_the_page_is_an_error_before_the_run(video, fail, tmp_path):
     source, box = video
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
@@ -163,7 +162,7 @@ def test_a_port_of_the_page_that_is_in_use_is_an_error_before_the_run(video, fai
     assert not (tmp_path / "state").exists()
 
 
-def test_a_path_without_permission_is_an_error_of_one_line(said, monkeypatch, tmp_path):
+def test_path_without_permission_is_an_error(said, monkeypatch, tmp_path):
     def denied(*_):
         raise PermissionError(errno.EACCES, "Permission denied", str(tmp_path))
 
@@ -173,7 +172,7 @@ def test_a_path_without_permission_is_an_error_of_one_line(said, monkeypatch, tm
     assert (code, errors) == (1, f"catstream: {expected}\n")
 
 
-def test_a_model_that_was_not_saved_before_an_interrupt_is_not_said_to_be(video, said, monkeypatch, tmp_path):
+def test_interrupted_run_reports_models_that_were_not_saved(video, said, monkeypatch, tmp_path):
     monkeypatch.setattr(Pipeline, "by_frame", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
     source, _ = video  # without a box: nothing is learned, however late the interrupt arrives
     code, _, errors = said("track", source, "--save-model", tmp_path / "model", "--write", tmp_path / "tracks.csv")
@@ -193,7 +192,7 @@ def test_interrupted_run_states_what_is_left_and_how_to_continue(tmp_path):
     assert kept == f"the results so far are kept; to continue: catstream track --resume {tmp_path}"
 
 
-def test_doubtful_options_are_reported_before_the_run_and_saved_models_after_it(video, said, succeed, tmp_path):
+def test_doubtful_options_are_reported_before_the_run(video, said, succeed, tmp_path):
     source, box = video
     words = ["--box", f"a={box}", "--box", f"b={box}", "--save-model", f"a={tmp_path / 'a'}"]
     _, errors = succeed("track", source, *words, "--end", 24)
@@ -208,7 +207,7 @@ def test_doubtful_options_are_reported_before_the_run_and_saved_models_after_it(
     assert "there is no object" not in errors, "without a name, the only one is meant"
 
 
-def test_time_in_which_a_run_waits_counts_neither_for_its_first_track_nor_its_rate(monkeypatch):
+def test_waiting_time_does_not_count_for_the_rate(monkeypatch):
     seconds = [100.0]
     monkeypatch.setattr(progress_module.time, "perf_counter", lambda: seconds[0])
     pipeline = SimpleNamespace(holding="", live=False, frames=9, health={}, totals={}, restarts=0, results=Results())
@@ -222,7 +221,7 @@ def test_time_in_which_a_run_waits_counts_neither_for_its_first_track_nor_its_ra
     assert progress._seconds() == pytest.approx(2.0)
 
 
-def test_results_that_another_run_wrote_while_this_one_waited_are_not_replaced(video, catstream, succeed, tmp_path):
+def test_paused_run_does_not_replace_results_of_another(video, catstream, succeed, tmp_path):
     source, box = video
     place = str(tmp_path / "my run")
     run = catstream("track", source, "--box", box, "--output", tmp_path, "--paused", "--set", f"run.endpoint={place}")

@@ -1,4 +1,4 @@
-"""`catstream track` on streams that never end: followed until Ctrl-C, whatever happens to them."""
+"""`catstream track` of live streams, until Ctrl-C."""
 
 import csv
 import re
@@ -65,7 +65,7 @@ def found(row, story):
     return bool(box) and max(box.overlap(truth) for _, truth in story) > 0.6
 
 
-def test_a_restarted_detector_tracks_an_http_stream_whose_frames_changed_their_size(camera, following, story):
+def test_restarted_detector_scales_frames_of_another_size(camera, following, story):
     scale = [1]
     cam = camera(lambda number: cv2.resize(story[number % len(story)][0], None, fx=scale[0], fy=1))
     with following(cam.url) as run:
@@ -83,7 +83,7 @@ def test_a_restarted_detector_tracks_an_http_stream_whose_frames_changed_their_s
     assert sum(found(row, story) for row in rows) > 0.8 * len(rows)
 
 
-def test_ctrl_c_ends_a_run_whose_stream_is_lost(camera, following, said, story, tmp_path):
+def test_ctrl_c_ends_a_run_with_a_lost_stream(camera, following, said, story, tmp_path):
     cam = camera(lambda number: story[number % len(story)][0])
     with following(cam.url) as run, subscribe(str(tmp_path / "run"), "tracks", timeout=500) as tracks:
         next(tracks)
@@ -104,6 +104,6 @@ REJECTED = {"omit lockstep": ["--lockstep"], "has no start, end or stride": ["--
 
 
 @pytest.mark.parametrize(("words", "options"), REJECTED.items(), ids=REJECTED)
-def test_options_that_a_stream_does_not_support_are_rejected_before_anything_starts(fail, tmp_path, options, words):
+def test_unsupported_options_of_a_stream_are_an_error(fail, tmp_path, options, words):
     assert words in fail("track", "http://127.0.0.1:1/one", "--box", "10,10,20,20", *options, cwd=tmp_path)
     assert not list(tmp_path.iterdir())

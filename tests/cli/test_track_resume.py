@@ -1,4 +1,4 @@
-"""`catstream track --state` and `--resume`: what was learned outlives every process, and its results continue."""
+"""`catstream track --state` and `--resume`: a run continues after all its processes were killed."""
 
 import csv
 import json
@@ -98,7 +98,7 @@ def killed(wreck):
     return shutil.copytree(copy, place)
 
 
-def test_a_run_whose_processes_were_all_killed_resumes_with_each_frame_once(killed, whole_run, succeed, fail, tmp_path):
+def test_killed_run_resumes_with_each_frame_once(killed, whole_run, succeed, fail, tmp_path):
     kept, out = killed / "state", killed / "tracks"
     before = len(frames(out))
     assert before < 32
@@ -115,7 +115,7 @@ def test_a_run_whose_processes_were_all_killed_resumes_with_each_frame_once(kill
     succeed("save", tmp_path / "one", "--state", kept, "--overwrite")
 
 
-def test_a_state_folder_that_is_in_use_or_has_other_settings_is_rejected(killed, video, fail, tmp_path):
+def test_invalid_state_folder_is_an_error(killed, video, fail, tmp_path):
     kept, (source, box) = killed / "state", video
     refusals = {
         "continue it": ["track", source, "--box", box, "--state", kept, "--output", killed / "tracks"],  # which exists
@@ -136,7 +136,7 @@ def test_a_state_folder_that_is_in_use_or_has_other_settings_is_rejected(killed,
         assert "a running pipeline uses the state" in fail("track", "--resume", kept, *elsewhere)
 
 
-def test_settings_that_are_given_again_change_and_all_others_stay(video, said, succeed, monkeypatch, tmp_path):
+def test_resumed_run_changes_only_the_settings_passed(video, said, succeed, monkeypatch, tmp_path):
     monkeypatch.setattr(Pipeline, "by_frame", lambda *_: iter(()))  # kept when it starts: no frame has to be followed
     (source, box), kept = video, tmp_path / "kept"
     assert said("track", source, "--box", box, "--state", kept, *OFTEN)[0] == 0
@@ -153,7 +153,7 @@ def test_settings_that_are_given_again_change_and_all_others_stay(video, said, s
         assert Job.load(kept).settings.changed() == [*changed, "run.checkpoint_seconds=0.05"]
 
 
-def test_a_complete_run_gets_no_further_rows_but_the_files_that_it_lacks(video, succeed, tmp_path):
+def test_resumed_complete_run_writes_only_missing_files(video, succeed, tmp_path):
     (source, box), kept, out = video, tmp_path / "kept", tmp_path / "out"
     succeed("track", source, "--box", box, "--end", 6, "--output", out, "--video", "--state", kept)
     before, written = (out / "demo.ndjson").read_bytes(), [file.stat().st_mtime_ns for file in out.iterdir()]
@@ -170,7 +170,7 @@ def test_a_complete_run_gets_no_further_rows_but_the_files_that_it_lacks(video, 
         assert annotated.frames == 6
 
 
-def test_killed_service_continues_by_the_command_that_began_it(killed, line, whole_run, succeed):
+def test_killed_service_continues_by_its_own_command(killed, line, whole_run, succeed):
     log = killed / "tracks" / "demo.ndjson"
     before = len(frames(log.parent))
     for says in ("present in", "is complete: to track the source again"):
@@ -182,7 +182,7 @@ def test_killed_service_continues_by_the_command_that_began_it(killed, line, who
 
 @pytest.mark.skipif(not shutil.which("systemd-analyze"), reason="no systemd-analyze: apt-get install systemd")
 @pytest.mark.parametrize("name", ["catstream@gate", "catstream-sink@gate", "catstream-fleet"])
-def test_systemd_finds_nothing_wrong_in_a_unit(tmp_path, name):
+def test_systemd_unit_is_valid(tmp_path, name):
     unit = tmp_path / f"{name}.service"
     text = (UNITS / unit.name.replace("gate", "")).read_text()
     unit.write_text(text.replace("/opt/catstream/bin/catstream", shutil.which("true")))
@@ -190,7 +190,7 @@ def test_systemd_finds_nothing_wrong_in_a_unit(tmp_path, name):
     assert (checked.returncode, checked.stderr) == (0, "")
 
 
-def test_resumed_run_writes_fewer_files_if_it_is_told_so(killed, succeed):
+def test_resumed_run_writes_the_destinations_passed(killed, succeed):
     kept, (csv, other), new = killed / "state", (killed / name for name in ("a.csv", "b.csv")), killed / "new"
     succeed("track", "--resume", kept, "--write", csv, "--write", other)
     before = other.read_bytes()
