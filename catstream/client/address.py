@@ -1,4 +1,4 @@
-"""Addresses of what a client attaches to, parsed once: where a program or the command line receives them.
+"""Addresses of running pipelines and of streams of fleets, parsed once where they enter the program.
 
 run                        the pipeline at this endpoint: a folder, or tcp://HOST:PORT
                            (empty) the only running pipeline of this user
@@ -22,7 +22,7 @@ _SCHEME = "fleet://"
 
 @dataclass(frozen=True, slots=True)
 class Address:
-    """A running pipeline, or a stream of a fleet, wherever it runs; and the keys to connect with.
+    """The address of a running pipeline or of a stream of a fleet, and the keys of the client.
 
     endpoint  of the pipeline; empty for the only running pipeline
     stream    name of the stream; empty for a pipeline
@@ -63,11 +63,11 @@ class Address:
 
     @property
     def registry(self) -> Registry:
-        """A connection to the registry of the fleet; close it."""
+        """A new connection to the registry of the fleet, which the caller closes."""
         return Registry(self.fleet, self.keys)
 
     def with_endpoint(self) -> Address:
-        """The same address; if it names no pipeline, the endpoint of the running one, kept when others start."""
+        """The same address; if it is empty, the endpoint of the only running pipeline, even if others start later."""
         if self.stream or self.endpoint:
             return self
         endpoint = self.resolve()
@@ -76,8 +76,8 @@ class Address:
     def resolve(self) -> Endpoint:
         """The endpoint of the pipeline, or of the current pipeline of the stream.
 
-        ServiceError if there is no such pipeline or stream, or the stream does not run; SilenceError if the registry
-        does not answer. A pipeline at an endpoint that is named may start later.
+        ServiceError if there is no such pipeline or stream, or the stream is not running; SilenceError if the registry
+        does not answer. With an explicit endpoint, the pipeline may start later.
         """
         if self.stream:
             with self.registry as registry:

@@ -45,22 +45,22 @@ def subscribe(
         "tracks", "models", "health", "samples", "features" or "previews": the messages are `Track`, `Model` and so on
         of `catstream.wire.messages`.
     object : str or None
-        Name of the one object whose tracks, models or samples are received; "" for the object without a name, None for
-        all objects.
+        Receive only the tracks, models or samples of the object with this name; "" for the object without a name, None
+        for all objects.
     timeout : float or None
         Seconds without a message after which iteration raises `SilenceError`; None to wait without limit.
     keys : str
         Folder of the keys of this client, if the pipeline requires keys.
     newest : bool
-        Whether each iteration returns the newest track of an object that was not read yet, or the newest features, and
-        passes over older ones: for a program that reacts, and is slower than the pipeline.
+        Whether each iteration returns the newest unread track of an object, or the newest features, and skips older
+        ones: for a program that reacts, and is slower than the pipeline.
 
     Raises
     ------
     ObjectError
         If `object` is not a valid name.
     ServiceError
-        If there is no such channel, or its messages are not about one object each; if `endpoint` is empty and not
+        If there is no such channel, or its messages are not about one object each; if `address` is empty and not
         exactly one pipeline runs; if the fleet has no such stream; or if the keys cannot be read.
     SilenceError
         If the registry of the fleet does not answer.
@@ -93,8 +93,8 @@ def control(
     Raises
     ------
     ServiceError
-        If `endpoint` is empty and not exactly one pipeline runs, if the fleet has no such stream or it runs nowhere, or
-        if the keys cannot be read.
+        If `address` is empty and not exactly one pipeline runs, if the fleet has no such stream or it is not running,
+        or if the keys cannot be read.
     """
     return Control(Address.parse(address, keys).resolve(), timeout=timeout)
 

@@ -58,8 +58,8 @@ class Control(AbstractContextManager["Control"]):
     """
 
     def __init__(self, endpoint: Endpoint, *, timeout: float = ANSWER_SECONDS) -> None:
-        self.timeout = timeout
-        self._connect(endpoint)
+        self.endpoint, self.timeout = endpoint, timeout
+        self._commands = Requester[Command, Answer](CONTROL, endpoint)
 
     @property
     def source(self) -> str:
@@ -71,53 +71,52 @@ class Control(AbstractContextManager["Control"]):
     ) -> Answer:
         """Set the box of an object in the next frame that is tracked: x, y, w, h in pixels.
 
-        During a pause it is the frame that is held, or the next one of a live source; the pipeline tracks it and stays
-        paused.
+        During a pause this is the frame at which a file is paused, or the next frame of a live source; the pipeline
+        tracks it and stays paused.
 
-        If no object has this name, it is tracked from that frame on, beside the others. Otherwise another object takes
-        the name, and everything that was learned of the previous one is dropped; with `keep`, the box corrects the
-        position of the same object.
+        A new name adds an object. An object that has this name is replaced, and its model is dropped; with `keep`, the
+        box corrects the position of the same object.
 
-        The box may have been drawn in a picture of a live source: `time` is the time of the `Preview`, of the last five
-        seconds. The object is searched for from there to the next frame. The frames are kept for this while anybody
-        receives previews, at most 256 MiB of them; a box of an older picture applies to the next frame.
+        For a box that was drawn in a preview of a live source, `time` is the time of the `Preview`, at most five
+        seconds old. The object is tracked from there to the next frame. The frames are stored for this while a client
+        receives previews, up to 256 MiB; a box of an older preview applies to the next frame.
         """
         return self.execute("set-box", object, box=Box.parse(box), keep=keep, time=time)
 
     def set_boxes(self, boxes: Mapping[str, str | Iterable[float]]) -> Answer:
         """Set the boxes of several objects, by name, in the next frame that is tracked: as `set_box`, but in one frame.
 
-        After an error in one box, no object begins.
+        If one box is invalid, no object is added.
         """
         return self.execute("set-box", boxes=boxes_by_name(boxes))
 
     def search(self, model: SavedModel | str | os.PathLike[str], object: str = UNNAMED) -> Answer:
-        """Search for the object of a saved model from the next frame on, beside the others.
+        """Search for the object of a saved model from the next frame on.
 
-        The model, or the path of its file on this machine, is sent to the pipeline, which keeps a copy. The object is
-        absent until it is found in the whole frame, and learning continues from the saved model. If an object has this
-        name already, this one takes its place, and everything that was learned of the previous one is dropped.
+        The model, or its file on this machine, is sent to the pipeline, which stores a copy. The object is absent until
+        it is found in the whole frame, and training continues from the saved model. An object that has this name is
+        replaced, and its model is dropped.
 
         Raises
         ------
         ServiceError, ProtocolError
             If the file cannot be read, or is not a saved model.
         """
-        learned = model if isinstance(model, SavedModel) else SavedModel.load(model)
-        return self.execute("search", object, model=learned.to_bytes())
+        saved = model if isinstance(model, SavedModel) else SavedModel.load(model)
+        return self.execute("search", object, model=saved.to_bytes())
 
     def forget(self, object: str = UNNAMED) -> Answer:
-        """Stop tracking an object, and drop everything that was learned of it.
+        """Stop tracking an object, and drop its model and coreset trees.
 
-        The other objects continue. If none is left, the run waits for a box, as if it was paused.
+        The other objects continue. Without any object, the run waits for a box, as during a pause.
         """
         return self.execute("forget", object)
 
     def pause(self, seconds: float | None = None) -> Answer:
         """Stop processing frames; the frames of a live source are counted as skipped.
 
-        The pause lasts until `resume`. With `seconds`, it ends by itself so long after the last such command: a program
-        that repeats it and then dies leaves nothing paused. 0 seconds end a pause of this kind, and no other.
+        The pause lasts until `resume`. With `seconds`, it ends that long after the last such command: if a program that
+        repeats the command dies, the run continues. `seconds=0` ends only a pause with a limit.
         """
         return self.execute("pause", seconds=seconds)
 
@@ -126,7 +125,7 @@ class Control(AbstractContextManager["Control"]):
         return self.execute("resume")
 
     def save(self, path: str | os.PathLike[str], object: str = UNNAMED) -> Answer:
-        """Write everything that was learned of an object to a file of this machine, which `catstream.SavedModel` reads.
+        """Save the model and the coreset trees of an object to a local file, which `catstream.SavedModel` reads.
 
         Raises
         ------
@@ -134,12 +133,12 @@ class Control(AbstractContextManager["Control"]):
             If the file cannot be written.
         """
         answer = self.execute("save", object)
-        learned = self._newest(answer.object, answer.version)
-        learned.save(path)
-        return replace(answer, version=learned.model.version)
+        saved = self._newest(answer.object, answer.version)
+        saved.save(path)
+        return replace(answer, version=saved.model.version)
 
     def stop(self) -> Answer:
-        """End the run as if the source had ended: everything learned is stored first."""
+        """End the run as if the source had ended: all trees and models are stored first."""
         return self.execute("stop")
 
     def execute(
@@ -189,7 +188,3 @@ class Control(AbstractContextManager["Control"]):
             f"no coreset trees arrived from {self.endpoint} within {self.timeout:g} s: "
             "check the pipeline with catstream status"
         )
-
-    def _connect(self, endpoint: Endpoint) -> None:
-        self.endpoint = endpoint
-        self._commands = Requester[Command, Answer](CONTROL, endpoint)

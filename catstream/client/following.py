@@ -1,4 +1,4 @@
-"""Subscribe to a stream of a fleet, wherever it runs."""
+"""Subscriptions to streams of fleets, which follow a stream from node to node."""
 
 from __future__ import annotations
 
@@ -10,25 +10,26 @@ from catstream.client.registry import Registry, described
 from catstream.client.subscription import DRAIN_SECONDS, Subscription
 from catstream.wire.messages import End, Features, StreamStatus, Track
 
-_QUIET_SECONDS = 1.0  # without a message of a stream, after which the registry is asked where it runs; then repeated
+_QUERY_SECONDS = 1.0  # interval of queries to the registry while no message arrives
 
 Message = TypeVar("Message")
 
 
 class StreamSubscription(Subscription[Message]):
-    """The messages of a stream of a fleet: the subscription reconnects wherever the stream runs, and drops repeats.
+    """A subscription to a stream of a fleet: it reconnects when the stream moves, and drops repeated frames.
 
-    While nothing arrives, the registry is asked once a second where the stream runs. If it does not answer, the last
-    answer holds. The end of a pipeline is the end of the stream only if the registry says so: a stream that moves is
-    stopped on one node, and continues on another. A frame that the stream repeats is not returned a second time.
+    While no message arrives, the registry is queried once a second; if it does not answer, the last answer remains
+    valid. The end of a pipeline is the end of the stream only if the registry reports it: a stream that moves stops on
+    one node, and continues on another.
     """
 
     def __init__(self, registry: Registry, stream: str, channel: str, **options: Any) -> None:
         self._registry, self._stream = registry, stream
-        self._status = self._at_start = StreamStatus(stream, "starting")  # newest state; that when its pipeline started
+        self._status = StreamStatus(stream, "starting")  # the newest one
+        self._connected = self._status  # the status at the last connection to a pipeline
         self._frames: dict[str, int] = {}  # the newest frame of each object
         self._pipeline_end: End | None = None
-        self._next_question = monotonic() + _QUIET_SECONDS
+        self._next_query = monotonic() + _QUERY_SECONDS
         try:
             super().__init__(None, channel, **options)
             self._update(registry.stream(stream))
@@ -38,30 +39,30 @@ class StreamSubscription(Subscription[Message]):
 
     def close(self) -> None:
         super().close()
-        with self._turn:
+        with self._lock:
             self._registry.close()
 
     def _receive(self) -> Message | None:
         while (message := super()._receive()) is not None:
-            self._next_question = monotonic() + _QUIET_SECONDS
+            self._next_query = monotonic() + _QUERY_SECONDS
             if not isinstance(message, Track | Features):
                 return message
             name = message.object if isinstance(message, Track) else UNNAMED
-            if message.frame > self._frames.get(name, -1):  # else the stream was started again, and repeats it
+            if message.frame > self._frames.get(name, -1):  # otherwise, the stream has restarted and repeats it
                 self._frames[name] = message.frame
                 return message
         return None
 
     def _pipeline_ended(self, end: End, seconds: float) -> None:  # noqa: ARG002  # it may continue elsewhere
-        self._pipeline_end, self._next_question = self._pipeline_end or end, monotonic()
+        self._pipeline_end, self._next_query = self._pipeline_end or end, monotonic()
         if self.end is not None and self._status.state == "ended":  # the answer of the registry was received first
             self.end = self._pipeline_end
 
     def _look_for_pipeline(self) -> None:
-        """Ask the registry if it is time to, and take its answer if it has arrived."""
-        if monotonic() >= self._next_question:
+        """Query the registry once an interval, and process its answer if it has arrived."""
+        if monotonic() >= self._next_query:
             self._registry.request(self._stream)
-            self._next_question = monotonic() + _QUIET_SECONDS
+            self._next_query = monotonic() + _QUERY_SECONDS
         if (answer := self._registry.receive()) is None:
             return
         if self._stream in answer.streams:
@@ -71,15 +72,15 @@ class StreamSubscription(Subscription[Message]):
             super()._pipeline_ended(End(0, gone), DRAIN_SECONDS)
 
     def _update(self, status: StreamStatus) -> None:
-        """Take the state from the registry: connect to another pipeline of the stream, or end with the stream."""
-        before, self._status = self._at_start, status
+        """Apply a status of the registry: connect to another pipeline of the stream, or end with the stream."""
+        before, self._status = self._connected, status
         if status.endpoint and (
             (status.endpoint, status.server, status.token) != (before.endpoint, before.server, before.token)
         ):
-            # A live stream uses the numbers of lost frames again, and another source counts from 0.
+            # A live stream reuses the numbers of lost frames, and another source counts from 0.
             if status.live or status.source != before.source:
                 self._frames.clear()
-            self._at_start, self._pipeline_end = status, None
+            self._connected, self._pipeline_end = status, None
             self._connect(self._registry.endpoint_of(status))
         if status.state == "ended":
             end = self._pipeline_end or End(0, f"the stream {self._stream} has ended")

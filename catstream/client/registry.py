@@ -1,8 +1,8 @@
-"""The client of the registry of a fleet: which streams there are, and where each of them runs.
+"""The client of the registry of a fleet, which lists its streams and the node of each.
 
-The controller of the fleet serves the registry, and knows the state of all streams. A client needs keys with the role
-"watch", or none on this machine. It gets the endpoint and the public key of a stream's pipeline, and connects with its
-own keys. No secret is transmitted.
+The controller of the fleet serves the registry. A client on another machine needs keys with the role "watch". It
+receives the endpoint and the public key of a stream's pipeline, and connects with its own keys. No secret is
+transmitted.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from catstream.wire.endpoint import Endpoint, resolved
 from catstream.wire.keys import Keys
 from catstream.wire.messages import FleetStatus, Listing, Question, StreamStatus
 
-#: Port at which the registry of a cluster listens by default.
+#: Default port of the registry of a cluster.
 REGISTRY_PORT = 5690
 
 
 class Registry(AbstractContextManager["Registry"]):
-    """Asks the controller of a fleet for its streams and nodes; SilenceError without an answer within the time limit.
+    """Queries the controller of a fleet for streams and nodes; SilenceError if no answer arrives before the timeout.
 
     `fleet` is HOST:PORT, the name of a fleet of this user on this machine, or empty for the only one; `keys` is the
     folder of the keys of this client, if the fleet requires keys.
@@ -59,14 +59,14 @@ class Registry(AbstractContextManager["Registry"]):
         return status.streams[stream]
 
     def running(self, stream: str) -> Endpoint:
-        """The endpoint of the pipeline of a stream; ServiceError if it does not run."""
+        """The endpoint of the pipeline of a stream; ServiceError if it is not running."""
         status = self.stream(stream)
         if not status.endpoint:
             raise ServiceError(f"stream {stream} is not running (state: {described(status)})")
         return self.endpoint_of(status)
 
     def endpoint_of(self, status: StreamStatus) -> Endpoint:
-        """The endpoint of the pipeline of a stream that runs, with the keys to connect."""
+        """The endpoint of the pipeline of a running stream, with the keys to connect."""
         keys = self._endpoint.keys
         if status.server and keys is None:
             raise ServiceError(
@@ -77,7 +77,7 @@ class Registry(AbstractContextManager["Registry"]):
         return replace(Endpoint.parse(status.endpoint, of_stream), source=status.source)
 
     def request(self, stream: str) -> None:
-        """Ask for one stream without waiting; `receive` returns the answer. A new request replaces the last one."""
+        """Query one stream without waiting; `receive` returns the answer. A new request replaces the last one."""
         self._question = uuid4().hex
         self._requester.send(Question(self._question, stream))
 
@@ -100,8 +100,8 @@ def _remote(fleet: str, keys: Keys | None) -> tuple[str, Endpoint]:
         raise ServiceError(f"the host {host!r} of the fleet is unknown: check its address")
     if keys is None and not fleet.startswith(("127.", "[::1]:", "localhost:")):
         raise ServiceError(
-            f"the fleet at {fleet} requires authentication: make keys on its head (catstream keys allow FOLDER/keys "
-            "NAME --output DIR), and pass them (--keys DIR)"
+            f"the fleet at {fleet} requires authentication: make keys on its head node (catstream keys allow "
+            "FOLDER/keys NAME --output DIR), and pass them (--keys DIR)"
         )
     return fleet, Endpoint.parse(f"tcp://{fleet}", keys or "")
 
@@ -131,5 +131,5 @@ def _status(answer: Listing) -> FleetStatus:
 
 
 def described(status: StreamStatus) -> str:
-    """The state of a stream and its trouble, in words."""
+    """Describe the state and the trouble of a stream."""
     return ", ".join(filter(None, (status.state, status.trouble)))

@@ -1,7 +1,7 @@
 """A saved model: everything learned about one object, in one file.
 
-The file contains the coreset trees whole, with the energy that they have lost, and the model that was trained from
-them. A run in another video continues from it, as if the frames of both had come from one stream.
+The file contains the complete coreset trees, with their dropped energy, and the model that was trained from them. A
+run in another video continues the training, as if the frames of both came from one stream.
 """
 
 from __future__ import annotations
@@ -36,16 +36,16 @@ from catstream.wire.storage import Metadata, pack, unpack
 
 _KIND = "saved model 5"  # kind of file, and the version of its contents
 
-#: Settings that say what a feature row and a tree contain: models can be merged, and continued, only if they agree.
+#: Settings that determine the content of rows and trees: models with different ones cannot be merged or continued.
 _SAME = ("coreset.size", "training.colours", "training.classifier")
 
-#: Similarity of two models, below which a merge is rejected, and below which it gives a warning: see decision 54.
+#: Similarity of two models below which a merge is rejected, and below which it causes a warning: see decision 54.
 _UNLIKE, _DOUBTFUL = 0.25, 0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SavedModel:
-    """Everything that was learned of an object. The trees are not changed: `compressor` makes copies of them.
+    """Everything learned about an object. The trees are never changed: `compressor` copies them.
 
     object    name of the object, empty for the object without a name
     trees     coreset tree of each head of `catstream.wire.heads`
@@ -66,7 +66,7 @@ class SavedModel:
 
     @classmethod
     def of(cls, compressor: Compressor, settings: Settings) -> Self:
-        """Everything that a compressor knows of its object, with a model trained from it.
+        """Make a saved model from the state of a compressor, and train its model.
 
         ServiceError if the trees have no leaf yet, or the object was not found yet.
         """
@@ -81,9 +81,9 @@ class SavedModel:
         return cls(name, trees, centres, compressor.origins, compressor.box, model, settings)
 
     def compressor(self, settings: Settings, name: str = "") -> Compressor:
-        """A compressor that inserts the frames of another stream into copies of the trees; versions continue.
+        """Continue copies of the trees with another stream, in which the object has this name; versions continue.
 
-        The object has this name in that stream. SettingsError as of `check_fits`.
+        SettingsError as in `check_fits`.
         """
         self.check_fits(settings)
         version = self.model.version
@@ -95,12 +95,12 @@ class SavedModel:
 
     @one_thread()
     def similarity(self) -> Similarity:
-        """Measures the similarity of a window to the object, from the trees: see `catstream.detection.similarity`."""
+        """The measure of the similarity of a window to the object: see `catstream.detection.similarity`."""
         tree, background = self.trees["object"], self.trees["background"]
         rows = tree.rows
-        whole = energy(rows) + tree.dropped_energy
+        total_energy = energy(rows) + tree.dropped_energy
         mean = (background.sum / background.rows_seen).astype(np.float32)
-        return Similarity.of(rows, whole, tree.sum, tree.rows_seen, mean)
+        return Similarity.of(rows, total_energy, tree.sum, tree.rows_seen, mean)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write one safetensors file, atomically.
@@ -137,7 +137,7 @@ class SavedModel:
         ServiceError
             If it does not exist, or cannot be read.
         ProtocolError
-            If it is damaged, another file, or one of other features.
+            If it is damaged, is not a saved model, or has other features.
         """
         try:
             data = Path(path).read_bytes()
@@ -149,7 +149,7 @@ class SavedModel:
 
     @classmethod
     def from_bytes(cls, data: bytes, name: str) -> Self:
-        """The reverse of `to_bytes`; `name` of the file is for errors, the same as in `load`."""
+        """The inverse of `to_bytes`, with the errors of `load`, which contain `name`."""
         arrays, metadata = storage.decode(data, name)
         try:
             if metadata.get("kind") != _KIND:
@@ -157,7 +157,7 @@ class SavedModel:
             trees = unpack_trees(arrays, metadata["trees"])
             if missing := [name for name in TREES if name not in trees]:
                 raise ValueError(f"it has no tree {missing[0]!r}: track the object again with this version")
-            learned = cls(
+            saved = cls(
                 check_name(metadata["object"]),
                 {name: trees[name] for name in TREES},
                 arrays["centres"],
@@ -166,19 +166,19 @@ class SavedModel:
                 unpack(Model, arrays, metadata["model"], "model"),
                 Settings.from_values(metadata["settings"]),
             )
-            learned._check()
+            saved._check()
         except (AttributeError, LookupError, OverflowError, TypeError, ValueError) as error:
             raise ProtocolError(f"{name} is not a saved model ({error}): `catstream save` writes one") from None
-        width = len(learned.model.weights)
+        width = len(saved.model.weights)
         if width != ROW_LENGTH:
             raise ProtocolError(
                 f"{name} has {width} features of a window, this catstream has {ROW_LENGTH}: "
                 "track the object again with this version"
             )
-        return learned
+        return saved
 
     def _check(self) -> None:
-        """Raise ValueError if the parts do not belong together."""
+        """Raise ValueError if the parts are inconsistent."""
         check_message(self.model)
         check_message(sample_of(self.trees, self.model.version, 0, self.centres, self.object))
         x, y, w, h = self.box
@@ -191,10 +191,9 @@ class SavedModel:
 
 
 def check_files(files: Mapping[str, Path], settings: Settings) -> None:
-    """Raise an error unless objects can begin with the saved models in these files, by name, in the first frame.
+    """Check that objects, by name, can begin with the saved models in these files in the first frame.
 
-    ServiceError or ProtocolError if one cannot be read; SettingsError if one was learned with other settings, or they
-    are too large.
+    ServiceError or ProtocolError if one cannot be read; SettingsError if one has other settings, or they are too large.
     """
     for file in files.values():
         SavedModel.load(file).check_fits(settings)
@@ -202,7 +201,7 @@ def check_files(files: Mapping[str, Path], settings: Settings) -> None:
 
 
 def check_sizes(sizes: Mapping[str, int]) -> None:
-    """Raise SettingsError if the saved models of objects, by name, have too many bytes to begin in one frame."""
+    """Raise SettingsError if the saved models of objects, by name, are too large to begin in one frame."""
     advice = "track fewer at once, or train them again with a smaller coreset.size"
     for name, size in sizes.items():
         if size > LARGEST_GIVEN_MODEL:
@@ -210,17 +209,17 @@ def check_sizes(sizes: Mapping[str, int]) -> None:
                 f"the saved model of {listed([name])} is too large ({size >> 20} MiB, limit "
                 f"{LARGEST_GIVEN_MODEL >> 20}): {advice}"
             )
-    if (together := sum(sizes.values())) > LARGEST_GIVEN_MODELS:
+    if (total := sum(sizes.values())) > LARGEST_GIVEN_MODELS:
         raise SettingsError(
-            f"the saved models of {listed(sizes)} are too large for one frame ({together >> 20} MiB together, limit "
+            f"the saved models of {listed(sizes)} are too large for one frame ({total >> 20} MiB together, limit "
             f"{LARGEST_GIVEN_MODELS >> 20}): {advice}"
         )
 
 
 def continued(features: Features, settings: Settings) -> dict[str, Compressor]:
-    """The compressors of the objects that begin with a saved model in a message, by name.
+    """The compressors, by name, of the objects that begin with a saved model in a message.
 
-    ProtocolError if a saved model is damaged, or one of other features; SettingsError if the settings do not suit it.
+    ProtocolError if a saved model is damaged or has other features; SettingsError if it has other settings.
     """
     models = {name: part.model for name, part in features.objects.items() if part.model}
     return {
@@ -229,9 +228,9 @@ def continued(features: Features, settings: Settings) -> dict[str, Compressor]:
     }
 
 
-@one_thread()  # also of the trees: more threads add in another order, which changes the bits
+@one_thread()  # more threads would add in another order, and change the bits
 def merge(parts: Iterable[SavedModel], *, force: bool = False) -> SavedModel:
-    """One saved model from several of the same object, as if one stream had contained all their frames.
+    """Merge saved models of one object, as if one stream had contained all their frames.
 
     The trees are merged, and a model is trained from them. The bound of the merged tree is the sum of the bounds plus
     the energy that the merge itself loses; both are in its `dropped_energy`. The order of the parts does not matter
@@ -252,7 +251,7 @@ def merge(parts: Iterable[SavedModel], *, force: bool = False) -> SavedModel:
     ------
     SettingsError
         If there are fewer than two, if their settings or names differ, if two contain the same frames, or if their
-        objects do not look alike (below 0.25); or if a part is no `SavedModel`, but for example the name of a file.
+        objects do not look alike (below 0.25); or if a part is not a `SavedModel`, for example a path.
     """
     parts = list(parts)
     if wrong := [part for part in parts if not isinstance(part, SavedModel)]:
@@ -320,12 +319,12 @@ def _check_alike(parts: Sequence[SavedModel]) -> None:
 def _trained(trees: dict[str, CoresetTree], centres: np.ndarray, version: int, name: str, settings: Settings) -> Model:
     from catstream.training.trainer import Trainer
 
-    with one_thread():  # as a pipeline's own trainer: the model has the same bits
+    with one_thread():  # as in a pipeline, for the same bits
         return Trainer(settings).train(sample_of(trees, version, 0, centres, name))
 
 
 def _check_same(ours: Settings, theirs: Settings, one: str, other: str) -> None:
-    """Raise SettingsError if settings that both sides share differ."""
+    """Raise SettingsError if one of the settings in `_SAME` differs."""
     own, others = ours.values(), theirs.values()
     for name in _SAME:
         if own[name] != others[name]:

@@ -1,7 +1,7 @@
 """The messages of a running pipeline, for `catstream.subscribe`.
 
 The pipeline never waits for a subscriber. A slow subscriber misses tracks, and `missed` counts them; `behind` is the
-age of the last one, and with `newest=True` older ones are passed over. With `object="anna"`, only the messages about
+age of the last one, and with `newest=True` older ones are skipped. With `object="anna"`, only the messages about
 this object are transmitted.
 """
 
@@ -24,15 +24,15 @@ from catstream.wire.endpoint import Endpoint
 from catstream.wire.messages import End, Features, Health, Track, run_state
 from catstream.wire.newest import GapCounter, Subscriber
 
-CHECK_SECONDS = 0.2  #: between two checks whether the pipeline has rejected the keys or removed its sockets, or moved
-REASON_SECONDS = 2.0  #: before the end of a timeout, in which a health report says why nothing arrives
-DRAIN_SECONDS = 0.5  #: for messages after the end, which arrives on a connection of its own and may overtake them
+CHECK_SECONDS = 0.2  #: interval of the checks for rejected keys, removed sockets and a moved stream
+REASON_SECONDS = 2.0  #: last part of a timeout, in which a health report is awaited for the reason
+DRAIN_SECONDS = 0.5  #: wait for messages that were overtaken by the end, which has its own connection
 
 Message = TypeVar("Message")
 
 
 class _Connection:
-    """The sockets of a subscription at one pipeline, and what the health reports of its detector say.
+    """The sockets of a subscription to one pipeline, and the content of the health reports of its detector.
 
     read    time of the frame that was read last
     newest  time of the newest frame, by the reports
@@ -48,12 +48,12 @@ class _Connection:
         with ExitStack() as stack:
             messages = Subscriber[Any](channel, endpoint, only, about=about, newest=newest)
             self.messages = stack.enter_context(messages)
-            # The end has a socket of its own: a slow subscriber could miss it among the messages that are dropped.
+            # The end has its own socket: a slow subscriber could miss it among the dropped messages.
             self.ends: Subscriber[Any] = Subscriber(TRACKS, endpoint, only=End)
             stack.pop_all()
 
     def receive_health(self) -> None:
-        """Receive the reports that have arrived; at the first call, the last one arrives at once."""
+        """Process the reports that have arrived; the first call connects, and the last report arrives at once."""
         self._health = self._health or Subscriber(HEALTH, self.endpoint)
         for report in self._health.receive_all():
             if report.process == "detector":
@@ -117,13 +117,13 @@ class Subscription(Generic[Message]):
         self._gaps = GapCounter(of_one_object=object is not None)
         self._open = partial(_Connection, self._channel, None if object is None else check_name(object), newest)
         self._connection: _Connection | None = None
-        self._close_time = float("inf")  # until which messages may still arrive after the end
-        self._is_over = False  # whether none had arrived at a look after that time
+        self._close_time = float("inf")  # end of the wait for overtaken messages
+        self._is_over = False  # True once all messages before the end were returned
         self._clock = RunningClock()  # of the timeout
-        self._has_run = endpoint is not None and not endpoint.lacks_sockets()  # whether the pipeline was there before
+        self._has_run = endpoint is not None and not endpoint.lacks_sockets()  # whether the pipeline has been running
         self._closed = False
         self._generation = generation()
-        self._turn = threading.RLock()  # a thread or a signal handler may close while another thread waits
+        self._lock = threading.RLock()  # a thread or a signal handler may close while another thread waits
         if endpoint is not None:
             self._connect(endpoint)
 
@@ -134,7 +134,7 @@ class Subscription(Generic[Message]):
 
     @property
     def missed(self) -> int:
-        """Number of frames whose tracks or features were not received, or were passed over.
+        """Number of frames whose tracks or features were not received, or were skipped.
 
         Frames of one object count between its first and its last frame.
         """
@@ -152,7 +152,7 @@ class Subscription(Generic[Message]):
         It is computed from the health reports of the pipeline, one a second, which are received from the first call on;
         0 before the first report, and on other channels.
         """
-        with self._turn:
+        with self._lock:
             if self._connection is None or self._channel.keeps != "every":
                 return 0.0
             self._connection.receive_health()
@@ -164,9 +164,9 @@ class Subscription(Generic[Message]):
         return self._connection.messages.run if self._connection is not None else ""
 
     def close(self) -> None:
-        """Disconnect. A loop of another thread or task ends with a ServiceError, soon."""
+        """Disconnect. Iteration in another thread or task raises a ServiceError soon after."""
         self._closed = True
-        with self._turn:
+        with self._lock:
             if self._connection is not None:
                 self._connection.close()
 
@@ -181,7 +181,7 @@ class Subscription(Generic[Message]):
 
     def __next__(self) -> Message:
         deadline = self._deadline()
-        while (message := self._take(deadline)) is None:
+        while (message := self._next_message(deadline)) is None:
             if self._is_over:
                 raise StopIteration
             self._poller(zmq.Poller()).poll(self._milliseconds(deadline))
@@ -191,10 +191,10 @@ class Subscription(Generic[Message]):
         return self
 
     async def __anext__(self) -> Message:
-        import zmq.asyncio  # a tenth of a second, with asyncio
+        import zmq.asyncio  # takes a tenth of a second, with asyncio
 
         deadline = self._deadline()
-        while (message := self._take(deadline)) is None:
+        while (message := self._next_message(deadline)) is None:
             if self._is_over:
                 raise StopAsyncIteration
             await self._poller(zmq.asyncio.Poller()).poll(self._milliseconds(deadline))
@@ -207,8 +207,8 @@ class Subscription(Generic[Message]):
         return float("inf") if self.timeout is None else self._clock() + self.timeout
 
     def _poller(self, poller: Any) -> Any:
-        """A poller of the sockets, by their descriptors, which another thread may close meanwhile."""
-        with self._turn:
+        """Register the descriptors of the sockets, which another thread may close meanwhile."""
+        with self._lock:
             if self._connection is not None and not self._closed:
                 for socket in (self._connection.messages, self._connection.ends):
                     poller.register(socket.fileno(), zmq.POLLIN)
@@ -219,20 +219,20 @@ class Subscription(Generic[Message]):
         remaining = self._close_time - monotonic() if self.end is not None else deadline - self._clock()
         return 1000 * max(0.0, min(remaining, CHECK_SECONDS))
 
-    def _take(self, deadline: float) -> Message | None:
+    def _next_message(self, deadline: float) -> Message | None:
         """The next message if one has arrived, without waiting; also runs periodic housekeeping."""
-        check_not_forked(self._generation)  # first: another thread of the original may have held the lock
-        with self._turn:
+        check_not_forked(self._generation)  # first: another thread may have held the lock during the fork
+        with self._lock:
             if self._closed:
                 raise ServiceError("the subscription is closed (perhaps by another thread or task): create a new one")
-            is_late = monotonic() >= self._close_time  # before the look: this thread may have been suspended
+            is_late = monotonic() >= self._close_time  # read before the sockets, as this thread may be suspended
             if (message := self._receive()) is not None:
                 self._has_run = True
                 return message
             if is_late and self.end is not None:
                 self._is_over = True
                 if self._channel.keeps == "every":
-                    self._gaps.end(self.end)  # the frames before it that have not arrived are missed
+                    self._gaps.end(self.end)  # earlier frames that have not arrived are missed
             if self.end is None:
                 self._look_for_pipeline()
             if self.end is None:
@@ -240,10 +240,10 @@ class Subscription(Generic[Message]):
             return None
 
     def _receive(self) -> Message | None:
-        """The next message if one has arrived; notes the end."""
+        """The next message if one has arrived; records the end of the pipeline."""
         if (connection := self._connection) is None:
             return None
-        connection.ends.pending()  # ZeroMQ subscribes again at a restarted pipeline only while the socket is looked at
+        connection.ends.pending()  # ZeroMQ subscribes to a restarted pipeline only while the socket is polled
         while (message := connection.messages.receive(0)) is not None:
             if not isinstance(message, End):
                 if isinstance(message, Track | Features):
@@ -257,7 +257,7 @@ class Subscription(Generic[Message]):
         return None
 
     def _check_timeout(self, remaining: float) -> None:
-        """Raise SilenceError if no time remains; shortly before, health reports are received for its reason."""
+        """Raise SilenceError if no time remains; shortly before, receive health reports for the reason."""
         if (self.timeout or 0.0) >= REASON_SECONDS > remaining and self._connection and self._channel is not HEALTH:
             self._connection.receive_health()
         if remaining <= 0:
@@ -265,19 +265,19 @@ class Subscription(Generic[Message]):
             raise SilenceError(f"no {self._channel.name} arrived{source} within {self.timeout:g} s: {self._silence()}")
 
     def _silence(self) -> str:
-        """The reason why no message arrives, as far as it is known."""
+        """The reason why no message arrives, if it is known."""
         if self._connection is not None and self._connection.state:
             return f"the state of the pipeline is: {self._connection.state}"
         return self.endpoint.hint() if self.endpoint is not None else "is a pipeline running there?"
 
     def _pipeline_ended(self, end: End, seconds: float) -> None:
-        """End after so many seconds."""
+        """Record the end; the wait for overtaken messages lasts `seconds`."""
         self.end, self._close_time = end, monotonic() + seconds
 
     def _look_for_pipeline(self) -> None:
-        """End if the pipeline has removed its sockets from its folder, its last step.
+        """End if the pipeline has removed its sockets, which is its last step.
 
-        A subscriber that did not read since a restart has no subscription there, and misses the end.
+        A subscriber that has not read since a restart is not subscribed any more, and misses the end.
         """
         if self.endpoint is not None and not self.endpoint.lacks_sockets():
             self._has_run = True

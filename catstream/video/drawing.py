@@ -16,7 +16,7 @@ from catstream.video.frames import jpeg
 from catstream.wire.messages import Preview, Track
 
 #: Colours as #rrggbb: distinguishable for colour-blind people, and light enough for dark text on them. In a picture,
-#: draw each beside a dark line, so that it is visible on a light ground too.
+#: outline each with a dark line, which is visible on a light background.
 PALETTE = (
     "#ff922b", "#3586ff", "#fedd38", "#e123c2", "#bae0b4", "#fd0304", "#76c6fe", "#5a8667", "#b7a59c",
 )  # fmt: skip
@@ -66,8 +66,8 @@ class Colours:
 def draw(image: np.ndarray, tracks: Sequence[Track], colours: Colours) -> np.ndarray:
     """Draw the boxes over a copy of a frame, and a line of text below it.
 
-    An object that is alone and has no name is drawn in the colour of its state. Otherwise each object has its own
-    colour, and its name at its box. The scores are below the frame.
+    A single unnamed object is drawn in the colour of its state. Otherwise, each object has its own colour, and its name
+    at its box. The scores are below the frame.
 
     The image is uint8 (h, w, 3), blue green red, the result uint8 (h + k, w, 3) with k rows for the text. There is at
     least one track; `colours` has the colours of earlier frames.
@@ -91,19 +91,19 @@ def draw(image: np.ndarray, tracks: Sequence[Track], colours: Colours) -> np.nda
 
 
 def drawn_size(size: tuple[int, int]) -> tuple[int, int]:
-    """Return width and height in pixels of what `draw` returns for a frame of this width and height."""
+    """Return the width and height of the image that `draw` returns for a frame of this width and height."""
     width, height = size
     return width, height + _text_height(width)
 
 
 def draw_preview(preview: Preview, tracks: Sequence[Track], colours: Colours) -> bytes:
-    """Draw the tracks of its frame into a preview, with a line of text below, empty without tracks: a JPEG file."""
+    """Draw the tracks of a frame and a line of text into its preview, and return a JPEG file."""
     image = preview_image(preview, tracks, colours)
     return preview.jpeg if image is None else jpeg(image)
 
 
 def preview_image(preview: Preview, tracks: Sequence[Track], colours: Colours) -> np.ndarray | None:
-    """The same as an image, uint8 (h, w, 3), blue green red; None if the preview cannot be decoded."""
+    """Return the image of `draw_preview`, uint8 (h, w, 3), blue green red; None if the preview cannot be decoded."""
     image = cv2.imdecode(np.frombuffer(preview.jpeg, np.uint8), cv2.IMREAD_COLOR)
     if image is None:
         return None
@@ -139,9 +139,9 @@ def _draw_box(canvas: np.ndarray, start: _Point, end: _Point, colour: _Colour, u
     thin, arm = max(1, round(1.2 * unit)), min(right - left, bottom - top) // 4
     cv2.rectangle(canvas, (left, top), (right, bottom), (0, 0, 0), thin + 2, cv2.LINE_AA)
     cv2.rectangle(canvas, (left, top), (right, bottom), colour, thin, cv2.LINE_AA)
-    for x, way in ((left, 1), (right, -1)):
+    for x, across in ((left, 1), (right, -1)):
         for y, down in ((top, 1), (bottom, -1)):
-            corner = np.array([(x + way * arm, y), (x, y), (x, y + down * arm)], np.int32)
+            corner = np.array([(x + across * arm, y), (x, y), (x, y + down * arm)], np.int32)
             cv2.polylines(canvas, [corner], False, colour, max(2, round(3 * unit)), cv2.LINE_AA)
 
 
@@ -152,18 +152,18 @@ def _draw_name(canvas: np.ndarray, track: Track, colour: _Colour, unit: float) -
     height, width = canvas.shape[:2]
     scale, thick, margin = 0.45 * unit, max(1, round(unit)), max(2, round(3 * unit))
     text = _plain(track.object)
-    (long, high), below = cv2.getTextSize(text, _FONT, scale, thick)
-    deep = high + below + margin
-    left = min(max(round(track.box.x), 0), max(width - long - 2 * margin, 0))
-    top = round(track.box.y) - deep
-    top = min(max(top if top >= 0 else round(track.box.y), 0), height - deep)
-    cv2.rectangle(canvas, (left, top), (left + long + 2 * margin, top + deep), colour, cv2.FILLED)
-    baseline = (left + margin, top + high + margin // 2 + 1)
+    (text_width, ascent), descent = cv2.getTextSize(text, _FONT, scale, thick)
+    label_width, label_height = text_width + 2 * margin, ascent + descent + margin
+    left = min(max(round(track.box.x), 0), max(width - label_width, 0))
+    top = round(track.box.y) - label_height
+    top = min(max(top if top >= 0 else round(track.box.y), 0), height - label_height)
+    cv2.rectangle(canvas, (left, top), (left + label_width, top + label_height), colour, cv2.FILLED)
+    baseline = (left + margin, top + ascent + margin // 2 + 1)
     cv2.putText(canvas, text, baseline, _FONT, scale, _BLACK, thick, cv2.LINE_AA)
 
 
 def _plain(text: str) -> str:
-    """Replace letters that OpenCV's fonts do not have: by those without accents, or else by question marks."""
+    """Remove accents, and replace letters that OpenCV's fonts lack by question marks."""
     letters = (letter for letter in unicodedata.normalize("NFKD", text) if not unicodedata.combining(letter))
     return "".join(letters).encode("ascii", "replace").decode()
 
@@ -173,13 +173,15 @@ def _text_width(text: str, unit: float) -> int:
 
 
 def _write(canvas: np.ndarray, text: str, left: int, unit: float) -> None:
-    place = (left, canvas.shape[0] - round(9 * unit))
-    cv2.putText(canvas, text, place, _FONT, 0.45 * unit, _WHITE, max(1, round(unit)), cv2.LINE_AA)
+    baseline = (left, canvas.shape[0] - round(9 * unit))
+    cv2.putText(canvas, text, baseline, _FONT, 0.45 * unit, _WHITE, max(1, round(unit)), cv2.LINE_AA)
 
 
 def _draw_scores(canvas: np.ndarray, drawn: Sequence[tuple[Track, _Colour]], unit: float) -> None:
-    """Write the name and score of each object, with a ring in place of the disc if it is absent, and the frame number;
-    if there is not enough room, the number of omitted objects. An object without a name has its state."""
+    """Write the name (or state) and score of each object, and the frame number.
+
+    A disc marks a present object, a ring an absent one. Without enough room, the number of omitted objects follows.
+    """
     width = canvas.shape[1]
     canvas[:] = _DARK
     middle, gap, left = canvas.shape[0] // 2, round(12 * unit), round(8 * unit)

@@ -1,7 +1,6 @@
 """`Frame`; `Source`, the base class of files and live sources; and the conversion of images.
 
-A frame is an 8-bit BGR array. `UprightConverter` makes it of what FFmpeg decoded, `as_bgr` of the arrays of other
-libraries.
+A frame is an 8-bit BGR array. `UprightConverter` converts frames of FFmpeg, `as_bgr` arrays of other libraries.
 """
 
 from __future__ import annotations
@@ -26,9 +25,9 @@ if TYPE_CHECKING:
     from av import FFmpegError, VideoFrame
     from av.container import InputContainer
 
-#: Frames per second of a source without time stamps, if none is given.
+#: Default frames per second of a source without time stamps.
 RATE = 25.0
-#: Between two calls of the `idle` of a live source while it has no frame.
+#: Interval of the calls of `idle` while a live source has no frame.
 IDLE_SECONDS = 0.1
 
 _CHANNELS = (1, 3, 4)
@@ -44,7 +43,7 @@ class Frame:
     time    seconds since the start of the video; for a live source, the arrival time
     image   uint8 (h, w, 3), blue green red; a grey image is expanded
     pts     presentation time stamp in a live stream, in seconds of the stream's own clock; None for a file, or if the
-            stream states none
+            stream has none
     """
 
     number: int
@@ -61,7 +60,7 @@ class Source(ABC):
     size          (width, height) of the first frame in pixels
     pixel_aspect  width of a pixel divided by its height
     live          whether the source is live: frames that are not read in time are lost
-    zero          of a live source: zero of the times of its frames, as `time.monotonic` gives it; None before the first
+    zero          of a live source: value of `time.monotonic` at time 0 of its frames; None before the first frame
     images        files of the images of a folder, one for each of its frames; empty for a video
     """
 
@@ -75,7 +74,7 @@ class Source(ABC):
 
     @property
     def frames(self) -> int | None:
-        """Number of frames of the source; None if it is unknown, as it is for a live source."""
+        """Number of frames of the source; None if it is unknown, for example of a live source."""
         return None
 
     @property
@@ -101,7 +100,7 @@ class Source(ABC):
 
 
 def describe_counters(counters: Mapping[str, float]) -> list[str]:
-    """The counters of a file or of images in words, a line each.
+    """Describe the counters of a file or of images, a line each.
 
     >>> describe_counters({"truncated": 2})
     ['truncated: the video ends 2 s before the end that its header states']
@@ -119,8 +118,8 @@ def describe_counters(counters: Mapping[str, float]) -> list[str]:
 def read_ahead(source: Source) -> Generator[Frame]:
     """Yield the frames of a source, and prefetch the next one in a thread: FFmpeg decodes without the GIL.
 
-    It is not for live sources, because a prefetched frame would be out of date. Errors of the source are raised in
-    order, after the frames before them. Close the generator before the source.
+    Not for live sources, whose prefetched frame would be outdated. An error of the source is raised after the frames
+    before it. Close the generator before the source.
     """
     with ThreadPoolExecutor(1, "reader") as reader:
         prefetched = reader.submit(next, source, None)
@@ -144,7 +143,7 @@ class UprightConverter:
 
     def __call__(self, frame: VideoFrame) -> np.ndarray:
         image = self._reformatter.reformat(frame, format="bgr24", threads=1).to_ndarray()
-        # With `frame.side_data`, the frame would refer to itself, and stay in memory until the next garbage collection.
+        # `frame.side_data` would create a reference cycle, and keep the frame until the next garbage collection.
         matrix: Any = None
         with suppress(ValueError):  # side data of a type that PyAV does not know: EXIF of a JPEG picture
             matrix = self._side_data(frame).get("DISPLAYMATRIX")
@@ -174,7 +173,7 @@ def open_video(text: str, hwaccel: str, **options: Any) -> InputContainer:
 
     device = HWAccel(hwaccel, allow_software_fallback=False) if hwaccel else None
     try:
-        # Text in the file, as its title, may be in any encoding.
+        # Metadata, for example a title, may be in any encoding.
         opened: InputContainer = av.open(text, hwaccel=device, metadata_errors="replace", **options)
     except (av.PermissionError, RuntimeError) as error:
         if device is None:
@@ -187,7 +186,7 @@ def open_video(text: str, hwaccel: str, **options: Any) -> InputContainer:
 
 
 def video_stream(container: InputContainer) -> Any:
-    """Return the video stream, not the stream of a cover picture; None if there is no video."""
+    """Return the video stream, which is not a cover picture; None if there is no video."""
     from av.stream import Disposition
 
     streams = [container.streams.best("video"), *container.streams.video]
@@ -200,7 +199,7 @@ def ffmpeg_reason(error: FFmpegError) -> str:
     return (error.strerror or str(error)).lower()
 
 
-#: How to make an array of what OpenCV returns or uses in its place.
+#: Advice for objects of OpenCV that are not arrays.
 _CONVERSIONS = {
     "UMat": "pass frame.get()",
     "GpuMat": "pass frame.download()",
@@ -210,9 +209,9 @@ _CONVERSIONS = {
 
 
 def as_bgr(image: object) -> np.ndarray:
-    """Return an image as a writable, contiguous uint8 array (h, w, 3), blue green red; no copy is made if it is one.
+    """Return an image as a writable, contiguous uint8 array (h, w, 3), blue green red; without a copy if possible.
 
-    It is of shape (h, w, 3) BGR, (h, w, 4) BGRA, (h, w) or (h, w, 1) grey. uint8 stays as it is; uint16 is reduced to
+    The shape is (h, w, 3) BGR, (h, w, 4) BGRA, (h, w) or (h, w, 1) grey. uint8 stays as it is; uint16 is reduced to
     its upper 8 bits; floats from 0 to 1 are scaled to 255 and rounded. An alpha channel is dropped. The array may be
     read-only and not contiguous. FrameError for any other array.
 

@@ -18,7 +18,7 @@ from catstream.errors import VideoError
 #: Suffixes of the files in a folder that are read as images.
 _IMAGES = "avif bmp dib hdr jfif jp2 jpe jpeg jpg pam pbm pfm pgm png pnm ppm ras sr tif tiff webp"
 IMAGES = {f".{suffix}" for suffix in _IMAGES.split()}
-#: Suffixes of those that may have several pages, which FFmpeg does not read. It reads the frames of APNG and AVIF.
+#: Suffixes of formats with several pages, which FFmpeg does not read. It reads the frames of APNG and AVIF.
 _PAGED = {".tif", ".tiff", ".webp"}
 _BATCH = 32  # pages of a file that are decoded together
 _ANY = cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH
@@ -50,12 +50,12 @@ def visible(folder: Path, kinds: set[str]) -> list[Path]:
 
 
 def natural_order(path: Path) -> list[tuple[int, str]]:
-    """Sort key by which 10 comes after 2."""
+    """Sort key that puts 10 after 2."""
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", path.name)]
 
 
 def pages_of(path: Path) -> list[tuple[Path, int]]:
-    """Return the pages of an image file; an empty list if it is no image, or FFmpeg has to read it."""
+    """Return the pages of an image file; an empty list if it is not an image, or FFmpeg has to read it."""
     suffix = path.suffix.lower()
     count = _page_count(path) if suffix in IMAGES else 0
     return [(path, page) for page in range(count)] if count == 1 or suffix in _PAGED else []
@@ -74,7 +74,7 @@ def _page_count(path: Path) -> int:
     """Return the number of pages of an image file, 1 for most; 0 if OpenCV cannot read it."""
     try:
         with path.open("rb") as file, _without_warnings():
-            # On Linux not by its name: OpenCV crashes if it is not UTF-8.
+            # On Linux by descriptor: OpenCV crashes on names that are not UTF-8.
             return cv2.imcount(f"/proc/self/fd/{file.fileno()}" if sys.platform == "linux" else str(path))
     except (OSError, cv2.error):
         return 0
@@ -83,8 +83,8 @@ def _page_count(path: Path) -> int:
 class ImageReader:
     """Reads images as uint8 (h, w, 3), blue green red.
 
-    Images of more than 8 bits, and of floats, are scaled by the range of the first of them: its darkest pixel becomes
-    0, and its brightest one 255.
+    Images of more than 8 bits or of floats are scaled by the range of the first image: its darkest pixel becomes 0, its
+    brightest one 255.
 
     pages  files, and the number of the page in each
     """
@@ -121,7 +121,7 @@ def of_one_size(image: np.ndarray, shape: tuple[int, ...], resize: bool, path: P
 
 
 def _range(image: np.ndarray) -> tuple[float, float]:
-    """The least and the largest finite value of an image."""
+    """The smallest and the largest finite value of an image."""
     finite = image[np.isfinite(image)]
     return (float(finite.min()), float(finite.max())) if finite.size else (0.0, 0.0)
 
@@ -132,18 +132,18 @@ def _decoded(path: Path, page: int) -> np.ndarray | None:
         try:
             if page:
                 return _batch(path, page // _BATCH)[page % _BATCH]
-            # Not by cv2.imread, which crashes at a name that is not UTF-8, and decodes the half of a JPEG.
+            # cv2.imread crashes on names that are not UTF-8, and decodes truncated JPEGs.
             data = path.read_bytes()
             if _is_cut_off(data):
                 return None
             return cv2.imdecodemulti(np.frombuffer(data, np.uint8), _ANY, range=(0, 1))[1][0]
-        except (OSError, cv2.error, IndexError):  # also if it is empty, or states more pixels than OpenCV reads
+        except (OSError, cv2.error, IndexError):  # or it is empty, or larger than OpenCV's limit
             return None
 
 
 @lru_cache(maxsize=1)
 def _batch(path: Path, number: int) -> Sequence[np.ndarray]:
-    """Return some pages of a file. OpenCV skips the pages before them; it miscounts the pages of a WebP."""
+    """Return a batch of pages. OpenCV skips earlier pages, except of a WebP, whose pages it miscounts."""
     data = np.memmap(path, np.uint8, "r")  # a stack of pages may be large
     if path.suffix.lower() == ".webp":
         return cv2.imdecodemulti(data, _ANY)[1][_BATCH * number :]
@@ -151,11 +151,11 @@ def _batch(path: Path, number: int) -> Sequence[np.ndarray]:
 
 
 def _is_cut_off(data: bytes) -> bool:
-    """Return True if this is a JPEG in which no end of the image (FF D9) follows its first scan (FF DA)."""
-    place = 2
-    while data[place : place + 1] == b"\xff" and data[place + 1 : place + 2] != b"\xda":
-        place += 2 + int.from_bytes(data[place + 2 : place + 4])
-    return data.startswith(b"\xff\xd8\xff") and data[place : place + 1] == b"\xff" and b"\xff\xd9" not in data[place:]
+    """Return True if this is a JPEG without an end of the image (FF D9) after its first scan (FF DA)."""
+    start = 2
+    while data[start : start + 1] == b"\xff" and data[start + 1 : start + 2] != b"\xda":
+        start += 2 + int.from_bytes(data[start + 2 : start + 4])  # skip a segment by its length
+    return data.startswith(b"\xff\xd8\xff") and data[start : start + 1] == b"\xff" and b"\xff\xd9" not in data[start:]
 
 
 @contextmanager

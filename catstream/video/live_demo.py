@@ -1,12 +1,11 @@
 """The demo video as a live source, `demo:SEED`, which needs no camera and never ends.
 
 It has 320 x 240 pixels, and `run.image_rate` frames per second. The seed is a number: it selects the sensor noise. Five
-seconds of the video play forwards, backwards, and so on; an image is rendered when it is due for the first time, and
-cached.
+seconds of the video play forwards, backwards, and so on; an image is rendered at its first use, and cached.
 
 As with a camera, frames that are not read in time are skipped and counted. Unlike a camera, the video begins when its
-first frame is read, so the box of `first_box` fits whenever the source is opened. A resumed run begins with the image
-of the number of its next frame.
+first frame is read, so `first_box` is right whenever the source is opened. A resumed run begins with the image that
+has the number of its next frame.
 """
 
 from __future__ import annotations
@@ -67,15 +66,15 @@ class LiveDemo(Source):
 
     @property
     def counters(self) -> dict[str, float]:
-        """`skipped`, the number of frames that were not read before the next one was due."""
+        """`skipped`, the number of frames that were not read in time."""
         return {"skipped": self._last + 1 - self._number}
 
     def __next__(self) -> Frame:
         if self._opened is None:
             self._image(self._start)
             self._opened = monotonic()
-        due = self._opened + (self._last + 1 - self._start) / self.rate
-        while not self._closed.is_set() and (seconds := due - monotonic()) > 0:
+        next_time = self._opened + (self._last + 1 - self._start) / self.rate
+        while not self._closed.is_set() and (seconds := next_time - monotonic()) > 0:
             self._closed.wait(min(seconds, IDLE_SECONDS))
             if seconds > IDLE_SECONDS and self._idle is not None and self._idle():
                 raise StopIteration
@@ -94,7 +93,7 @@ class LiveDemo(Source):
 
     @cached_property
     def _demo(self) -> rendered.Demo:
-        """Made for the first image: a source may be opened without being read."""
+        """Created for the first image, because a source may be opened without being read."""
         return rendered.Demo(_SIZE, self._seed)
 
     def _image(self, number: int) -> np.ndarray:

@@ -1,6 +1,6 @@
 """NAL units of H.264 as RTP transports them, for a decoder that does not wait for the next frame.
 
-FFmpeg's parser passes a frame on when the next one begins, because the last unit of a frame looks like any other: a
+FFmpeg's parser passes a frame on when the next one begins, because the last unit of a frame has no mark: this is a
 delay of one frame. Without the parser, FFmpeg passes on the content of each RTP packet (RFC 6184): whole units, or a
 fragment of one. All fragments of a unit but the last have one length, so a shorter one ends it; and a decoder with the
 flag for chunks returns a frame as soon as it has the last macroblock.
@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from av import Packet
 
-#: Options of FFmpeg: the packets of RTP, at once.
+#: Options of FFmpeg for RTP packets without delay.
 OPTIONS = {"fflags": "noparse", "probesize": "32", "analyzeduration": "1"}
 
 _START = b"\0\0\0\1"  # of a unit, which FFmpeg writes before its header
@@ -30,7 +30,7 @@ class NalUnits:
     def __init__(self) -> None:
         self._unit = b""  # so far
         self._length = 0  # of its first fragment
-        self._longest = 0  # of a fragment that another one has followed
+        self._longest = 0  # of a fragment that was not the last one of its unit
         self._pts: int | None = None
 
     def take(self, packet: Packet[Any]) -> Iterator[Packet[Any]]:

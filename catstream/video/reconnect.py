@@ -1,6 +1,6 @@
-"""Decides how a live source connects again after a loss: a table, without I/O and without a clock.
+"""Decides how a live source reconnects after a loss: a table, without I/O and without a clock.
 
-An address is read in one mode or two, of which the first one is tried first.
+An address has one or two modes of reading, the preferred one first.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ _FIRST_BACKOFF, _LONGEST_BACKOFF = 0.25, 8.0
 #: H.264 in RTP packets without FFmpeg's parser; FFmpeg's demuxer and parser; its demuxer that searches for JPEGs only.
 Mode = Literal["rtp", "parsed", "jpegs"]
 
-#: The server closed the connection; nothing or no frame arrived in time; FFmpeg cannot read the data; any other error.
+#: The server closed the connection; no frame arrived in time; FFmpeg cannot read the data; any other error.
 Kind = Literal["ended", "silent", "invalid", "failed"]
 
 #: The next mode after a loss, by the kind of the loss and by whether the mode has delivered a frame.

@@ -2,7 +2,7 @@
 
 A dahlia moves over a picture of a lake while the camera pans. It rotates and
 changes its size, the brightness changes, a dahlia of another colour crosses
-it, a pagoda occludes it, and it leaves the image and returns at another place.
+it, a pagoda occludes it, and it leaves the image and returns elsewhere.
 The same arguments give the same pixels.
 """
 
@@ -15,7 +15,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy import random  # now: numpy would import it at its first use, and lose a Ctrl-C meanwhile
+from numpy import random  # early: numpy's lazy import would lose a Ctrl-C
 
 from catstream.base.box import Box
 from catstream.video.writer import VideoWriter
@@ -152,8 +152,8 @@ class Demo:
         box = self.dahlia.box(transform) if visible >= _VISIBLE else None
         if self.size == SIZE:
             return picture, box
-        wide, high = self.size[0] / SIZE[0], self.size[1] / SIZE[1]
-        box = box and Box(box.x * wide, box.y * high, box.w * wide, box.h * high)
+        across, down = self.size[0] / SIZE[0], self.size[1] / SIZE[1]
+        box = box and Box(box.x * across, box.y * down, box.w * across, box.h * down)
         return cv2.resize(picture, self.size, interpolation=cv2.INTER_AREA), box
 
 
@@ -187,43 +187,43 @@ class Sprite:
     mask: np.ndarray
     outline: np.ndarray
 
-    def transform(self, place: np.ndarray, view: np.ndarray) -> np.ndarray:
+    def transform(self, pose: np.ndarray, view: np.ndarray) -> np.ndarray:
         """Return the affine map from the sprite to the picture, float64 (2, 3).
 
-        `place` has x and y of the centre in the scene, the size of the whole sprite in pixels, and the angle in
+        `pose` has x and y of the centre in the scene, the size of the whole sprite in pixels, and the angle in
         degrees; `view` maps the scene to the picture, by a shift.
         """
-        (x, y, diameter, angle), side = place, self.mask.shape[0]
-        turn = cv2.getRotationMatrix2D((side / 2, side / 2), angle, diameter / side)
-        turn[:, 2] += np.array([x, y]) + view[:, 2] - side / 2
-        return turn
+        (x, y, diameter, angle), side = pose, self.mask.shape[0]
+        transform = cv2.getRotationMatrix2D((side / 2, side / 2), angle, diameter / side)
+        transform[:, 2] += np.array([x, y]) + view[:, 2] - side / 2
+        return transform
 
-    def box(self, turn: np.ndarray) -> Box:
+    def box(self, transform: np.ndarray) -> Box:
         """Return the box of the whole object in the picture."""
-        low, high = self._limits(turn)
+        low, high = self._limits(transform)
         return Box(*map(float, (*low, *(high - low))))
 
-    def paint(self, image: np.ndarray, turn: np.ndarray, free: np.ndarray) -> float:
-        """Paint the part of the object that nothing occludes into an image, float32 (h, w, 3); return its share.
+    def paint(self, image: np.ndarray, transform: np.ndarray, free: np.ndarray) -> float:
+        """Paint the visible part of the object into an image, float32 (h, w, 3); return its share.
 
-        `free`, float32 (h, w), is 1 for pixels in which nothing occludes the object.
+        `free`, float32 (h, w), is 1 for pixels without an occluder.
         """
         height, width = image.shape[:2]
-        low, high = self._limits(turn)
+        low, high = self._limits(transform)
         left, top = np.maximum(np.floor(low) - 2, 0).astype(int)
         right, bottom = np.minimum(np.ceil(high) + 2, (width, height)).astype(int)
         if left >= right or top >= bottom:
             return 0.0
         patch, size = image[top:bottom, left:right], (int(right - left), int(bottom - top))
-        shift = turn - np.array([[0, 0, left], [0, 0, top]])
+        shift = transform - np.array([[0, 0, left], [0, 0, top]])
         colours = cv2.warpAffine(self.colours, shift, size, borderMode=cv2.BORDER_REPLICATE)
         alpha = cv2.warpAffine(self.mask, shift, size) * free[top:bottom, left:right]
         patch += alpha[..., None] * (colours - patch)
-        return float(alpha.sum() / (self.mask.sum() * abs(np.linalg.det(turn[:, :2]))))
+        return float(alpha.sum() / (self.mask.sum() * abs(np.linalg.det(transform[:, :2]))))
 
-    def _limits(self, turn: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _limits(self, transform: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the top left and bottom right corners of the object in the picture."""
-        points = self.outline @ turn[:, :2].T + turn[:, 2]
+        points = self.outline @ transform[:, :2].T + transform[:, 2]
         return points.min(axis=0), points.max(axis=0)
 
 

@@ -1,4 +1,4 @@
-"""Opens sources of frames. One text names the source, as a user types it.
+"""Opens a source of frames from the text that a user types.
 
     with open_source("walk.mp4") as source:
         for frame in source:
@@ -105,8 +105,12 @@ class FileSource(Source):
 
 
 def counters_of(reader: Images | VideoFile) -> dict[str, float]:
-    """`damaged`: number of skipped packets, one for each frame; `scaled`: number of frames that were scaled to the size
-    of the first one; `truncated`: seconds at the end that are missing."""
+    """The counters of a reader that are not 0.
+
+    damaged    number of skipped packets, one for each frame
+    scaled     number of frames that were scaled to the size of the first one
+    truncated  seconds missing at the end
+    """
     names = ("damaged", "scaled", "truncated")
     return {name: count for name in names if (count := getattr(reader, name))}
 
@@ -127,16 +131,15 @@ def open_source(
     start     number of the first frame to return, counted within the part. In a file, the frames before it are decoded
               and dropped; a live source numbers its first frame `start`
     part      the frames of a file or folder that are read, for example `slice(100, 200, 2)` for 100, 102 ... 198
-    since     zero of the time stamps of a live source, as `time.monotonic` gives it; None for its first frame
-    rate      frames per second of a live source, None if that is not known: FFmpeg then measures it for half a second
+    since     value of `time.monotonic` at time 0 of a live source; None for its first frame
+    rate      frames per second of a live source; None to let FFmpeg measure it for half a second
     idle      is called ten times a second while a live source has no frame; if it returns True, iteration ends. With
               it, opening a live source never fails: iteration waits for the first frame without a timeout, and the size
               is unknown until then
     settings  the settings of a run; `image_rate`, `hwaccel`, `skip_damaged` and `resize` are used
     single    values by name that replace those in `settings`
 
-    VideoError if the source does not exist or cannot be read; from the iterator where it cannot be decoded, after the
-    frames before.
+    VideoError if the source does not exist or cannot be read. The iterator raises it where a frame cannot be decoded.
     """
     settings = (settings or RunSettings()).replace(**single)
     if min(part.start or 0, part.stop or 0) < 0 or (part.step is not None and part.step < 1):
@@ -194,13 +197,13 @@ def _open_reader(path: Path, settings: RunSettings) -> tuple[str, Images | Video
 
 
 def _folder_name(folder: Path) -> str:
-    """The name of a folder of images for results; of an `img` folder, the name of the sequence around it."""
+    """The name of a folder of images for results; for an `img` folder, the name of the sequence."""
     folder = folder.resolve()
     return (folder.name in _FOLDERS and folder.parent.name) or folder.name
 
 
 def source_text(source: object) -> str:
-    """The text of a source in a program; of a file:// address of this machine its path.
+    """The text of a source argument; a local file:// address becomes its path.
 
     >>> source_text("file:///videos/a%20walk.mp4"), source_text(Path("walk.mp4")), source_text(0)
     ('/videos/a walk.mp4', 'walk.mp4', '0')
@@ -220,7 +223,7 @@ def source_text(source: object) -> str:
 
 
 class Images:
-    """Images that are read as frames. `scaled` is the number of images that had another size than the first one."""
+    """Images as frames. `scaled` is the number of images that had another size than the first one."""
 
     damaged, truncated, pixel_aspect = 0, 0, Fraction(1)
 
@@ -254,5 +257,5 @@ class Images:
 
 
 def prepare() -> None:
-    """Import the modules that read a video."""
+    """Import the modules that read a video in advance."""
     import av.video.reformatter  # noqa: F401

@@ -4,19 +4,18 @@ from __future__ import annotations
 
 from fractions import Fraction
 
-#: Time stamps that go back by more belong to another recording, which was joined to the one before.
+#: A larger decrease of time stamps is the beginning of another recording in a joined file.
 _JOIN_SECONDS = 1.0
 
 
 class FrameClock:
     """Gives each decoded frame its time in seconds since the first frame. Times only grow.
 
-    A time is FFmpeg's best effort, computed as in its `best_effort_timestamp`, which PyAV does not have: the time of
-    presentation, or the time of decoding if presentation went back more often, as in files that state the times of
-    decoding only.
+    A time is computed as FFmpeg's `best_effort_timestamp`, which PyAV lacks: the time of presentation, or the time of
+    decoding if presentation times have decreased more often, for example in files that have times of decoding only.
 
-    Where recordings were joined, and the time stamps begin again, time goes on. A frame without a time stamp, or whose
-    time does not grow, is one frame period after the frame before it.
+    In joined recordings, time continues where the time stamps start again. A frame whose time stamp is missing, or does
+    not increase, is one frame period after the previous frame.
 
     rate       frames per second
     time_base  seconds of a tick of the time stamps; None if the container has no time stamps

@@ -18,10 +18,10 @@ from catstream.video.times import FrameClock
 if TYPE_CHECKING:
     from av import Packet, VideoFrame
 
-#: Number of errors of the container without a packet between them after which a file is treated as ended.
+#: Number of successive errors of the container after which a file is treated as ended.
 _MAX_FAILURES = 3
 
-#: A Matroska file whose pictures end this much (in seconds) before the end that its header states may be truncated.
+#: Missing seconds at the end, by its header, above which a Matroska file is reported as truncated.
 _TRUNCATED_SECONDS = 1.0
 
 #: The frames of a larger file (in bytes) are estimated from its duration instead of being counted.
@@ -29,8 +29,12 @@ _MAX_COUNTED_BYTES = 1 << 30
 
 
 class VideoFile:
-    """A video file that is read once. `damaged` is the number of skipped packets, `scaled` the number of frames that
-    had another size than the first one, `truncated` the seconds that its header states after the last frame."""
+    """A video file, which is read once.
+
+    damaged    number of skipped packets
+    scaled     number of frames that had another size than the first one
+    truncated  seconds of the stated duration after the last frame
+    """
 
     images: Sequence[Path] = ()
 
@@ -48,7 +52,7 @@ class VideoFile:
             self.container.close()
             raise VideoError(f"there is no video in {str(path)!r}: {EXPECTED}")
         self.stream.thread_type = thread_type  # "NONE": the processes of the pipeline already use the cores
-        # An AVI has the times of decoding only, which the demuxer gives to pictures that are in another order.
+        # An AVI has times of decoding only; its demuxer states them as times of presentation.
         self._is_avi = self.container.format.name == "avi"
         # A stream without a container, as raw H.264, has no time stamps, but may state its rate.
         has_times = not av.format.Flags(self.container.format.flags) & av.format.Flags.no_timestamps
@@ -62,7 +66,7 @@ class VideoFile:
         with video.container:
             index, stated = video.stream.index_entries, video.stream.frames
             if 0 < stated <= len(index):
-                # Entries without data repeat the frame before; those that are discarded are before a cut.
+                # Entries without data repeat the previous frame; discarded entries precede a cut.
                 return sum(entry.size > 0 and not entry.is_discard for entry in index) or None
             if self.path.stat().st_size > _MAX_COUNTED_BYTES:
                 return stated or round((video.container.duration or 0) / 1e6 * self.rate) or None
@@ -78,13 +82,13 @@ class VideoFile:
                     image = upright(frame)
                     if shape is None:
                         shape = image.shape
-                        if shape[0] != frame.height:  # it was turned
+                        if shape[0] != frame.height:  # rotated
                             self.pixel_aspect = 1 / self.pixel_aspect
                     scaled = of_one_size(image, shape, self.settings.resize, self.path, number)
                     self.scaled += scaled is not image
                     if number in rest:
                         yield Frame(wanted.index(number), time, scaled)
-                if number + 1 >= wanted.stop:  # damage after the part must not be an error
+                if number + 1 >= wanted.stop:  # do not read on: damage after the part is no error
                     return
             self.set_truncated()
 
@@ -94,10 +98,10 @@ class VideoFile:
         return self._clock.time(number, None if self._is_avi else pts, dts)
 
     def set_truncated(self) -> None:
-        """Compare the time of the last frame with the end that the header of a Matroska file states.
+        """Compare the time of the last frame with the duration in the header of a Matroska file.
 
-        FFmpeg ends without an error where such a file is truncated. It does not for others, or estimates their
-        durations from the available data.
+        FFmpeg reads a truncated file of this kind without an error. For others, it reports an error, or estimates the
+        duration from the available data.
         """
         if "matroska" not in self.container.format.name:
             return
@@ -109,14 +113,14 @@ class VideoFile:
             self.truncated = round(end - self._end)
 
     def decoded(self, packets: Iterable[Packet[Any] | str | None], begin: int | None = None) -> Iterator[VideoFrame]:
-        """Yield what FFmpeg decodes. At an error, raise VideoError, or continue at the next keyframe.
+        """Yield decoded frames. At an error, raise VideoError, or continue at the next keyframe.
 
-        begin : frames with an earlier time stamp are dropped, damaged or not
+        begin : drop frames with an earlier time stamp, even damaged ones
         """
         import av
 
         decoder, skip, good = self.stream.codec_context, self.settings.skip_damaged, 0
-        waits_for_key = is_spoilt = False  # of the packets after an error, and of the frames after a damaged one
+        waits_for_key = is_spoilt = False  # after an error of a packet, and after a damaged frame
         for packet in packets:
             if waits_for_key and isinstance(packet, av.Packet) and not packet.is_keyframe:
                 self.damaged += 1
@@ -130,7 +134,7 @@ class VideoFile:
             waits_for_key = bool(problem)
             if problem and skip:
                 self.damaged += 1
-                with contextlib.suppress(av.FFmpegError):  # the decoder still holds frames before it
+                with contextlib.suppress(av.FFmpegError):  # the decoder still has earlier frames
                     frames = decoder.decode(None)
                 decoder.flush_buffers()
             for frame in frames:
@@ -161,7 +165,7 @@ class VideoFile:
                 packet = next(packets, None)
             except av.FFmpegError as error:
                 packets = self.container.demux(self.stream)  # continues at the current position
-                if not isinstance(error, av.BlockingIOError):  # that asks to try again
+                if not isinstance(error, av.BlockingIOError):  # which means: try again
                     failures += 1
                     yield ffmpeg_reason(error)
                 continue
@@ -169,7 +173,7 @@ class VideoFile:
                 break
             if packet.size:
                 failures = 0
-                # MPEG-TS counts again from 0 where files were joined. This is no damage; what the decoder lacks is.
+                # FFmpeg marks the first packet of a joined MPEG-TS file. The decoder reports real damage.
                 packet.is_corrupt = False
                 yield packet
         yield None

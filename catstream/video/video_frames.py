@@ -1,8 +1,7 @@
-"""The images of a video by number: those that `open_source` returns in order.
+"""Random access to the images of a video.
 
-A frame is decoded from the last keyframe before it, so that neither the memory nor the disk holds the whole video. The
-order of the frames follows from the packets alone in the containers and codecs of which that is certain; other files
-are decoded once, without keeping the images.
+A frame is decoded from the last keyframe before it, so neither memory nor disk holds the whole video. Frames are
+numbered by their packets alone in containers and codecs where this is reliable. Other files are decoded once for this.
 """
 
 from __future__ import annotations
@@ -34,7 +33,7 @@ from catstream.video.video_file import VideoFile
 if TYPE_CHECKING:
     from av import Packet, VideoFrame
 
-#: Called with the number of frames that are numbered, and of all; None if that is unknown.
+#: Called with the number of numbered frames, and the number of all frames or None.
 Progress = Callable[[int, int | None], object]
 
 #: Containers and codecs in which each packet holds one frame, and frames are in the order of their time stamps.
@@ -42,19 +41,19 @@ _CONTAINERS = ("mov", "matroska")
 _CODECS = ("h264", "hevc", "av1", "vp9", "mjpeg", "prores", "dnxhd", "ffv1")
 _VERIFIED = 8  #: frames that are decoded to verify this
 
-#: Decoders that can skip each frame to which no other one refers.
+#: Decoders that can skip frames without references to them.
 _SKIPPABLE = ("h264", "mpeg2video", "mpeg4")
 
 _CACHE_BYTES = 32 << 20  #: of decoded frames, in the pixel format of the video
 _NO_STAMP = -(1 << 63)
-_ATTEMPTS = 5  #: seeks to earlier and earlier keyframes, and packets after each, until one is known
-_COLUMNS = 6  #: of `_row`
+_ATTEMPTS = 5  #: limit of seeks to earlier keyframes, and of packets after each, until a packet is recognised
+_COLUMNS = 6  #: length of a `_row`
 _INTERVAL = 256  #: packets between two calls of a `Progress`
 
 
 @dataclass(frozen=True)
 class _Index:
-    """The frames of a video file in order, and its packets in theirs.
+    """The frames and the packets of a video file, each in their own order.
 
     packets  int (frames,), number of the packet of each frame; -1 if the decoder does not state it
     rows     int (packets, 6), see `_row`
@@ -77,9 +76,9 @@ class _Index:
 
     @cached_property
     def starts(self) -> list[tuple[int, int]]:
-        """First frame and packet of each part that can be decoded alone: keyframes which follow all frames before."""
+        """First frame and packet of each part that can be decoded alone, at keyframes after all earlier frames."""
         starts, keys, end = [(0, 0)], np.flatnonzero(self.rows[:, 3]), len(self.rows)
-        # Around damage, which is noticed late, the picture of a keyframe may depend on earlier ones.
+        # Damage is noticed late: near it, a keyframe may depend on earlier pictures.
         damaged = np.r_[0, self.rows[:, 5]][[0, *keys, end, end]]
         for key in keys[damaged[:-3] == damaged[3:]] if self.is_unique else ():
             if (number := self.numbers[key]) > starts[-1][0]:
@@ -88,8 +87,8 @@ class _Index:
 
 
 def _row(packet: Packet[Any], damaged: int = 0) -> tuple[int, ...]:
-    """Place of a packet in the file, time stamp of presentation in ticks, size, whether it is a keyframe, whether its
-    frame is discarded, and the number of damaged packets before it."""
+    """Position of a packet in the file, time stamp of presentation in ticks, size, whether it is a keyframe, whether
+    its frame is discarded, and the number of damaged packets before it."""
     position, stamp = (_NO_STAMP if value is None else value for value in (packet.pos, packet.pts))
     return position, stamp, packet.size, packet.is_keyframe, packet.is_discard, damaged
 
@@ -97,8 +96,8 @@ def _row(packet: Packet[Any], damaged: int = 0) -> tuple[int, ...]:
 class VideoFrames:
     """Random access to the images of a video, uint8 (h, w, 3) in BGR: frame n is the n-th image of `open_source`.
 
-    Reading forwards decodes each frame once. Reading backwards decodes a group of pictures once if it fits into the
-    cache, otherwise once for each part that does. Several threads may read. A pickled copy opens the file anew.
+    Reading forwards decodes each frame once. Reading backwards decodes a group of pictures once for each part that fits
+    into the cache. Several threads may read. A pickled copy opens the file anew.
 
     Parameters
     ----------
@@ -157,9 +156,9 @@ class VideoFrames:
             self._reader = None
 
     def scan(self, progress: Progress = lambda *_: None, *, exact: bool = False) -> None:
-        """Number the frames: from the packets if that is certain, else, or if `exact`, by decoding all.
+        """Number the frames by their packets if this is reliable, otherwise, or if `exact`, by decoding all.
 
-        VideoError if a frame cannot be decoded; those before it are numbered.
+        VideoError if a frame cannot be decoded; the frames before it are numbered.
         """
         try:
             if isinstance(self._source, Images):
@@ -180,12 +179,13 @@ class VideoFrames:
             self.times, self.is_exact, self.counters = np.array(times), exact, counters_of(images)
 
     def _scan_packets(self, path: Path, progress: Progress) -> bool:
-        """Number the frames by the time stamps of the packets; return False if that is not certain."""
+        """Number the frames by the time stamps of the packets; return False if this is not reliable."""
         video, rows = VideoFile(path, self.settings), array("q")
         containers, codec = video.container.format.name.split(","), video.stream.codec_context.codec.canonical_name
         with video.container:
             if codec not in _CODECS or not set(containers) & set(_CONTAINERS):
                 return False
+            # Step 1: read all packets, without decoding.
             for number, packet in enumerate(video.packets(), 1):
                 if isinstance(packet, str):
                     return False
@@ -194,9 +194,10 @@ class VideoFrames:
                     if number % _INTERVAL == 0:
                         progress(number, None)
             _, stamps, _, keys, discarded, _ = np.array(rows).reshape(-1, _COLUMNS).T
+            # Step 2: sort the shown frames by time stamp.
             shown, keys = discarded == 0, keys == 1
             ordered = np.flatnonzero(shown)[stamps[shown].argsort(kind="stable")]
-            # A frame is between the keyframes around its own: stamps do not begin again, and none leads the first one.
+            # Step 3: stamps must increase, and each must lie between the keyframes before and after its own.
             limits, group = stamps[keys], keys.cumsum() - 1
             low, high = np.r_[limits[:1], limits[:-1]], np.r_[limits[1:], sys.maxsize]
             is_certain = keys[:1].all() and (np.diff(stamps[ordered]) > 0).all() and stamps.min() != _NO_STAMP
@@ -204,6 +205,7 @@ class VideoFrames:
                 return False
             times = [video.time(number, stamp, None) for number, stamp in enumerate(stamps[ordered].tolist())]
             video.set_truncated()
+        # Step 4: decode some frames to verify the order.
         self._publish(video, times, ordered, rows)
         with suppress(VideoError):
             self[min(_VERIFIED, len(self) - 1)]
@@ -211,7 +213,7 @@ class VideoFrames:
         return False
 
     def _decode_all(self, path: Path, progress: Progress) -> None:
-        """Number the frames that FFmpeg decodes: a frame has the time stamp of its packet, which is its number here."""
+        """Number the frames by decoding all: a frame inherits the time stamp of its packet, here a number."""
         video, stop, total = VideoFile(path, self.settings), range(sys.maxsize)[self._part].stop, None
         times, packets, rows, upright = array("d"), array("q"), array("q"), UprightConverter()
         if count := video.count():
@@ -267,11 +269,11 @@ class _Reader:
         bits = (pixels and pixels.padded_bits_per_pixel) or 24
         self._capacity = max(2, 8 * _CACHE_BYTES // (width * height * bits))
         self._cache: dict[int, VideoFrame] = {}
-        self._run: Iterator[int] = iter(())  # decodes frames into the cache, and yields their numbers
+        self._run: Iterator[int] = iter(())  # the current decoding: fills the cache, and yields numbers of frames
         self._next = 0  # number of the frame that follows in the run
 
     def close(self) -> None:
-        self._run = iter(())  # it refers to this reader, whose memory would only be freed by a garbage collection
+        self._run = iter(())  # breaks a reference cycle, which would delay the release of memory
         self._video.container.close()
 
     def image(self, number: int) -> UInt8:
@@ -281,16 +283,16 @@ class _Reader:
         return of_one_size(image, self._shape, self._settings.resize, self._path, number)
 
     def _decode(self, number: int) -> None:
-        """Put a frame into the cache, and as many before it as it holds, unless it follows in the run."""
+        """Put a frame into the cache, with earlier ones unless the current run is about to decode it."""
         starts = self._index.starts
-        place = bisect_right(starts, number, key=itemgetter(0)) - 1
-        if starts[place][0] <= self._next <= number:
-            self._cache.clear()  # reading forwards needs none
+        start = bisect_right(starts, number, key=itemgetter(0)) - 1
+        if starts[start][0] <= self._next <= number:
+            self._cache.clear()  # reading forwards needs no cache
             if number in self._run:
                 return
-        begin, problem = max(starts[place][0], number - self._capacity + 1), None
+        begin, problem = max(starts[start][0], number - self._capacity + 1), None
         # A decoder may need more than one keyframe before its pictures are complete.
-        for attempt in dict.fromkeys(max(0, place - back) for back in (0, 1, 2, place if self._is_exact else 0)):
+        for attempt in dict.fromkeys(max(0, start - back) for back in (0, 1, 2, start if self._is_exact else 0)):
             self._run, self._next = self._decode_from(attempt, begin), begin
             try:
                 if number in self._run:
@@ -299,26 +301,26 @@ class _Reader:
                 problem = error
         raise problem or VideoError(f"frame {number} of {str(self._path)!r} cannot be decoded")
 
-    def _decode_from(self, place: int, begin: int) -> Iterator[int]:
-        """Decode from one of the starts on, put the frames from number `begin` on into the cache, yield their numbers.
+    def _decode_from(self, start: int, begin: int) -> Iterator[int]:
+        """Decode from `start`, an index of the starts; cache the frames from `begin` on, and yield their numbers.
 
         The time stamp of a packet, which its frame inherits, is replaced by the number of the frame. The iterator ends
         before the first frame that is missing.
         """
-        index, first = self._index, self._index.starts[place][1]
-        start, packets = self._seek(place)
+        index, first = self._index, self._index.starts[start][1]
+        first_packet, packets = self._seek(start)
         context = self._video.stream.codec_context
         context.flush_buffers()
         skips = context.codec.name in _SKIPPABLE and index.is_unique and not self._settings.skip_damaged
 
         def numbered() -> Iterator[Packet[Any] | str | None]:
-            number = start
+            number = first_packet
             for packet in packets:
                 if number == len(index.rows):
                     break
                 if packet is not None and not isinstance(packet, str):
                     packet.pts = int(index.numbers[number])
-                    if skips:  # frames before `begin` to which no other one refers
+                    if skips:  # frames before `begin` without references to them
                         context.skip_frame = "NONREF" if 0 <= packet.pts < begin else "DEFAULT"
                     number += 1
                 if number > first:
@@ -337,23 +339,23 @@ class _Reader:
             self._next += 1
             yield number
 
-    def _seek(self, place: int) -> tuple[int, Iterator[Packet[Any] | str | None]]:
+    def _seek(self, start: int) -> tuple[int, Iterator[Packet[Any] | str | None]]:
         """Return the number of a packet at or before a start, and an iterator of the packets from it on.
 
-        Where a container seeks to is known by the packets that it then has. If that fails, the file is opened again.
+        The packets after a seek show its position. If they are not recognised, the file is opened again.
         """
         import av
 
         rows, starts = self._index.rows, self._index.starts
-        for _, key in starts[place : max(0, place - _ATTEMPTS) : -1]:
+        for _, key in starts[start : max(0, start - _ATTEMPTS) : -1]:
             with suppress(av.FFmpegError):
                 self._video.container.seek(int(rows[key, 1]), stream=self._video.stream)
                 packets = self._video.packets()
                 for packet in islice(packets, _ATTEMPTS):
                     if packet is not None and not isinstance(packet, str):
-                        found = np.flatnonzero((rows[:, :3] == _row(packet)[:3]).all(axis=1))
-                        if len(found) == 1 and found[0] <= starts[place][1]:
-                            return int(found[0]), chain([packet], packets)
+                        matches = np.flatnonzero((rows[:, :3] == _row(packet)[:3]).all(axis=1))
+                        if len(matches) == 1 and matches[0] <= starts[start][1]:
+                            return int(matches[0]), chain([packet], packets)
         self._video.container.close()
         self._video = VideoFile(self._path, self._settings, self._threads)
         return 0, self._video.packets()

@@ -14,7 +14,7 @@ import numpy as np
 from catstream.base.files import open_locked
 from catstream.errors import VideoError
 
-#: Steps of the time base per frame: the precision of time stamps if the frame rate is not constant.
+#: Ticks of the time base per frame: the precision of time stamps at a variable frame rate.
 _TICKS_PER_FRAME = 100
 
 #: Seconds between keyframes, at the average rate.
@@ -30,15 +30,15 @@ _OPTIONS = {"movflags": "hybrid_fragmented", "frag_duration": "1000000", "flush_
 class Encoder:
     """Encodes images as H.264 without delay: each image results in one packet, which refers to the one before it.
 
-    Packets are for the PyAV output `container`, which gets a stream; without one, they are access units in Annex B
-    format. `rate` is the average of frames per second, `size` the width and height of the images. VideoError if this
-    FFmpeg has no encoder.
+    Packets are for the PyAV output `container`, to which a stream is added; without a container, they are access units
+    in Annex B format. `rate` is the average of frames per second, `size` the width and height of the images. VideoError
+    if this FFmpeg has no encoder.
     """
 
     def __init__(
         self, size: tuple[int, int], rate: float, container: Any = None, *, pixel_aspect: Fraction = Fraction(1)
     ) -> None:
-        import av  # imported here because only the writing of videos needs it
+        import av  # a slow import, for writing only
 
         if "libx264" not in av.codecs_available:
             raise VideoError("PyAV lacks the H.264 encoder libx264: pip install --force-reinstall av")
@@ -91,9 +91,9 @@ class Encoder:
 class VideoWriter(contextlib.AbstractContextManager["VideoWriter"]):
     """Writes images as H.264 to an MP4 file.
 
-    It grows in fragments of a second: if the process is killed or the disk is full, it is readable up to there.
-    Its folder is made, and it is locked until it is closed. A file without a frame is removed, and so is one whose
-    `with` block is left by an error or Ctrl-C.
+    It grows by fragments of a second: if the process is killed or the disk is full, it is readable up to the last one.
+    Its folder is created, and it is locked until it is closed. The file is removed if it has no frame, or if its `with`
+    block is left by an error or Ctrl-C.
 
     path : file, which is replaced
     rate : average of frames per second
