@@ -1,6 +1,6 @@
-"""Many videos: boxes in a table, and the tracks of each video, which one process computes.
+"""Tracks the objects of many videos, each video in one process, from a table of boxes.
 
-An object with one box is tracked frame by frame from there to the end of its video. An object with boxes in several
+An object with one box is tracked from its frame to the end of the video. An object with boxes in several
 frames is annotated: `catstream.annotate` tracks between them, and checks the frames.
 """
 
@@ -64,7 +64,7 @@ class Summary:
     frames    number of frames with a track
     tracks    number of tracks: one for each object and frame
     present   tracks with a box
-    doubtful  tracks that should be looked at
+    doubtful  tracks that need a check by eye
     checked   tracks that are keyframes or checked
     error     reason why the video was not tracked to its end; empty if it was
     boxes     `Video.boxes`
@@ -98,9 +98,9 @@ _COLUMNS = tuple(field.name for field in fields(Summary))
 def read_videos(table: Path) -> list[Video]:
     """Read the videos of a table with the columns file, object, x, y, w, h, and optionally frame.
 
-    A path is relative to the folder of the table. The frame is 0 by default. An empty object has no name; `absent` in
-    x is no box. Raises VideoError if the table cannot be read, a column is missing, a value is invalid, or two videos
-    have the same name; BoxError if an object has two boxes in one frame.
+    A path is relative to the folder of the table. The default of frame is 0. An object may have an empty name, and x
+    may be `absent`. Raises VideoError if the table cannot be read, a column is missing, a value is invalid, or two
+    videos have the same name; BoxError if an object has two boxes in one frame.
     """
     boxes: dict[str, list[Keyframe]] = {}
 
@@ -127,12 +127,12 @@ def read_videos(table: Path) -> list[Video]:
 
 
 def check_results(videos: Iterable[Video], output: Path) -> None:
-    """Raise VideoError if a folder has results that are not of these videos, or not of a batch."""
+    """Raise VideoError if a folder has results of other videos, or of another command."""
     for video in videos:
         log = output / f"{video.name}.ndjson"
         if not (output / SUMMARIES).exists():
             _files(video, output, overwrite=False)
-        elif log.exists() and log.stat().st_size:  # an emptied log is tracked again, as a removed one
+        elif log.exists() and log.stat().st_size:  # a video with an empty log is tracked again
             source = (Log(log).header() or Header()).source
             if os.path.realpath(source) != os.path.realpath(video.path):
                 raise VideoError(
@@ -144,7 +144,7 @@ def check_results(videos: Iterable[Video], output: Path) -> None:
 class Batch:
     """The videos of a batch, and the table batch.csv in the folder of the results.
 
-    rows  the rows by video, also those of other tables; none of a video that failed, has other boxes, or lacks a file
+    rows  the rows by video, including the rows of other tables, without videos that have to be tracked again
     """
 
     def __init__(self, videos: Sequence[Video], output: Path, *, overwrite: bool) -> None:
@@ -159,7 +159,7 @@ class Batch:
 
     @property
     def missing(self) -> list[Video]:
-        """The videos that are still to be tracked."""
+        """The videos that remain to be tracked."""
         return [video for video in self.videos if video.file not in self.rows]
 
     def track(self, settings: Settings, jobs: int) -> Generator[Summary]:
@@ -210,7 +210,7 @@ def track_video(video: Video, output: Path, settings: Settings) -> Summary:
 
 
 def read_summaries(path: Path) -> list[Summary]:
-    """Read the rows of batch.csv; none if it does not exist, VideoError if it is another table."""
+    """Read the rows of batch.csv; empty if it does not exist, VideoError if it is another table."""
     if not path.exists():
         return []
     try:
@@ -241,7 +241,7 @@ def _frames(video: Video, settings: Settings, stack: ExitStack) -> tuple[Header,
     changed = tuple(annotation.settings.changed())
     header = Header(source=str(video.path), size=frames.size, rate=frames.rate, frames=len(frames), settings=changed)
 
-    # Step 2: add the others from their boxes on. Their own run would begin at frame 0.
+    # Step 2: add the other objects, whose run begins at the frame of the first box.
     def merged() -> Iterator[TrackedFrame]:
         part, others = _tracked(video.path, single, settings, stack) if single else (Header(), iter(()))
         for number, tracks in enumerate(zip(*annotation.tracks.values(), strict=True)):
@@ -256,7 +256,7 @@ def _frames(video: Video, settings: Settings, stack: ExitStack) -> tuple[Header,
 def _tracked(
     path: Path, keyframes: Mapping[str, Mapping[int, KeyframeBox]], settings: Settings, stack: ExitStack
 ) -> tuple[Header, Iterator[TrackedFrame]]:
-    """Track objects, each from its only box on; the same tracks as of `catstream track` in lockstep."""
+    """Track objects, each from its only box on, with the same tracks as `catstream track` in lockstep."""
     begins: dict[int, dict[str, Box]] = {}
     for name, boxes in keyframes.items():
         for frame, box in boxes.items():

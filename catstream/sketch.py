@@ -73,7 +73,7 @@ class CoresetPCA(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimato
         return self
 
     def merge(self, other: CoresetPCA) -> Self:
-        """Add the rows of another estimator of the same size, with the bound of one into which all were inserted.
+        """Add the rows of another estimator of the same size; the bound holds as if one had received all rows.
 
         ValueError if its columns differ in number, names or order.
         """
@@ -96,7 +96,7 @@ class CoresetPCA(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimato
         return coordinates
 
     def inverse_transform(self, X: Any) -> Float64:
-        """The rows that have these coordinates, and none beside the components: float64 (k, d)."""
+        """The rows with these coordinates in the span of the components, float64 (k, d)."""
         check_is_fitted(self)
         rows: Float64 = check_array(X, dtype=_TYPES) @ self.components_ + self.mean_
         return rows
@@ -130,16 +130,16 @@ class CoresetPCA(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimato
         """Singular values and components."""
         with one_thread():
             strongest = reduce(self.tree_.rows, min(self.n_components or self.size, self.n_features_in_))
-            # Once more in float64: the components are orthonormal, also where the rows have no variance.
+            # Repeated in float64: components without variance are orthonormal as well.
             left, values, components = np.linalg.svd(strongest.astype(np.float64), full_matrices=False)
         return values, svd_flip(left, components, u_based_decision=False)[1]
 
     def _insert(self, rows: np.ndarray, begin: bool) -> None:
         if begin:
-            most = min(self.size, rows.shape[1])
-            if self.n_components is not None and not 1 <= self.n_components <= most:
+            limit = min(self.size, rows.shape[1])
+            if self.n_components is not None and not 1 <= self.n_components <= limit:
                 raise ValueError(
-                    f"n_components={self.n_components} is not between 1 and min(size, features)={most}: "
+                    f"n_components={self.n_components} is not between 1 and min(size, features)={limit}: "
                     "choose fewer components, or a larger size"
                 )
             self.tree_, self.n_samples_seen_, self.mean_ = CoresetTree(self.size), 0, rows[0].astype(np.float64)

@@ -16,8 +16,8 @@ from catstream.base.addresses import without_passwords
 from catstream.cli.common import INTERRUPTS, complain, stopped
 from catstream.errors import CatstreamError, ServiceError, require_linux
 
-#: Command -> its module, and its summary. The module is imported when the command is called, because some imports take
-#: long; commands that belong together share one.
+#: Command -> its module and its summary. A module is imported when its command is called, because some imports are
+#: slow.
 COMMANDS = {
     "track": ("track", "Track objects in a video."),
     "annotate": ("annotate", "Track objects between boxes at keyframes, and check the tracks."),
@@ -61,7 +61,7 @@ def load_command(name: str) -> click.Command:
 
 class _Commands(click.Group):
     def list_commands(self, _: click.Context) -> list[str]:
-        return list(COMMANDS)  # in this order, also in the reference
+        return list(COMMANDS)  # unsorted, for help and reference
 
     def get_command(self, context: click.Context, name: str) -> click.Command | None:
         if name == "track" and not context.resilient_parsing:
@@ -74,7 +74,7 @@ class _Commands(click.Group):
     def invoke(self, context: click.Context) -> object:
         try:
             return super().invoke(context)
-        except (KeyboardInterrupt, click.Abort):  # click would report it as an error
+        except (KeyboardInterrupt, click.Abort):  # otherwise, click reports an error
             stopped()
         except click.UsageError as error:
             raise click.UsageError(without_passwords(error.format_message()), error.ctx) from None
@@ -105,10 +105,10 @@ def main() -> None:
         from catstream.base.system import name_process
 
         name_process("catstream", shown)
-    os.environ["PYTHONSAFEPATH"] = "1"  # no child of this process imports a file of the current folder
-    # FFmpeg asks a proxy, if the environment names one, even for cameras on this machine.
+    os.environ["PYTHONSAFEPATH"] = "1"  # child processes import no file of the current folder
+    # FFmpeg uses a proxy of the environment even for cameras on this machine.
     os.environ["no_proxy"] = ",".join(filter(None, ("127.0.0.1,localhost", os.environ.get("no_proxy"))))
-    if sys.stdout is None:  # it was closed before the start (>&-): the output is dropped
+    if sys.stdout is None:  # closed by the parent (>&-): drop the output
         sys.stdout = os.fdopen(os.open(os.devnull, os.O_WRONLY), "w")
     cast(io.TextIOWrapper, sys.stdout).reconfigure(errors="surrogateescape")  # names of files need not be UTF-8
     try:
@@ -117,14 +117,14 @@ def main() -> None:
         complain(error)
         sys.exit(1)
     except PermissionError as error:
-        if error.filename is None:  # it is about no file
+        if error.filename is None:  # not about a file
             raise
         complain(f"cannot use {error.filename!r} ({error.strerror}): change its permissions, or use another path")
         sys.exit(1)
     except OSError as error:
         if error.errno != errno.ENOSPC:
             raise
-        # The interpreter flushes standard output again when it exits: that must not fail a second time.
+        # The interpreter flushes standard output again when it exits, which must not fail a second time.
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
         complain(f"cannot write any more: {error.strerror}")
         sys.exit(1)

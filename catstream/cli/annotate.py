@@ -121,7 +121,7 @@ def annotate(
 
 
 def _listed(words: Iterable[str]) -> list[str]:
-    """The videos of paths and patterns. A folder without images stands for the videos, and folders of them, in it."""
+    """The videos of paths and patterns; a folder without images is replaced by the videos and image folders in it."""
 
     def holds(folder: Path, kinds: set[str]) -> bool:
         return any(each.is_dir() and visible(each, kinds) for each in (folder, folder / "img"))
@@ -142,12 +142,12 @@ def _listed(words: Iterable[str]) -> list[str]:
 def _serve(
     videos: list[str], output: Path | None, settings: Settings, jobs: int, listen: HostPort, *, overwrite: bool
 ) -> None:
-    """Serve the page of some videos until it is done or interrupted, and write the results."""
+    """Serve the page of the videos until it is done or interrupted, and write the results."""
     from catstream.offline.annotation import Annotation
     from catstream.offline.keyframes import by_object, read_keyframes
     from catstream.offline.session import Session, Sessions
 
-    # Step 1: Name the videos that can be read, and their folders.
+    # Step 1: select the readable videos, and name their folders.
     names: dict[str, str] = {}
     for video in videos:
         try:
@@ -167,7 +167,7 @@ def _serve(
     folders = [output] if output and not several else [(output or Path()) / f"{label}-annotation" for label in labels]
     check_distinct(zip((f"the results of {video}" for video in names), folders, strict=True), VideoError)
 
-    # Step 2: Each video is opened when the page first shows it, and continues with its saved boxes.
+    # Step 2: serve the page. A video is opened when the page first shows it, with its saved boxes.
     context = click.get_current_context()
 
     def start(number: int) -> Session:
@@ -192,7 +192,7 @@ def _serve(
             with INTERRUPTS.deferred():
                 session.write()
 
-    # Step 3: Report each of them.
+    # Step 3: report the results of each opened video.
     opened = sorted(sessions.opened.items())
     for number, session in opened:
         if several:
@@ -209,13 +209,13 @@ def _serve(
 
 
 def _share(log: Path) -> float:
-    """The share of checked frames in the log of an earlier command, from 0 to 1; 0 without one."""
+    """The share of checked frames, from 0 to 1, in the log of an earlier command; 0 without a log."""
     text = log.read_bytes() if log.exists() else b""
     return 1 - text.count(b",unchecked,") / (text.count(b"\n") - 1) if text.count(b"\n") > 1 else 0.0
 
 
 def _track(annotation: Annotation, results: _ResultFiles, bar: Progress) -> bool:
-    """Track between all boxes, and write the results; return whether it was interrupted."""
+    """Track between all boxes, and write the results; return True if it was interrupted."""
     interrupted = False
     with bar:
         bar.add_task("reading", total=None)
@@ -231,7 +231,7 @@ def _track(annotation: Annotation, results: _ResultFiles, bar: Progress) -> bool
 
 
 def serve(sessions: Sessions, listen: HostPort) -> bool:
-    """Serve the page of sessions until it is done or interrupted; return whether it was interrupted."""
+    """Serve the page of sessions until it is done or interrupted; return True if it was interrupted."""
     from catstream.web.annotator import AnnotationSite
 
     server = server_of(AnnotationSite(sessions), listen)
@@ -240,7 +240,7 @@ def serve(sessions: Sessions, listen: HostPort) -> bool:
             click.echo(url)
         with suppress(KeyboardInterrupt):
             while not sessions.current.finished.wait(0.5):
-                pass  # without a limit, a signal that arrives just before it waits is handled after it only
+                pass  # without a timeout, a signal just before the wait would only be handled after it
     return not sessions.current.finished.is_set()
 
 
@@ -253,7 +253,7 @@ def show_progress(bar: Progress, work: str, done: int, total: int | None) -> Non
 
 
 class _ResultFiles:
-    """The log of the tracks, the keyframes, and the frames to look at next, in a folder."""
+    """The results in a folder: the log of the tracks, the keyframes, and the frames to look at next."""
 
     def __init__(self, annotation: Annotation, video: str, folder: Path) -> None:
         self._annotation, self._video, self.folder = annotation, video, folder
@@ -261,7 +261,7 @@ class _ResultFiles:
         annotation.stored = folder / "passes.safetensors"
 
     def check(self, *, overwrite: bool) -> None:
-        """Raise VideoError if a file could not be written, or is there and should not be overwritten."""
+        """Raise VideoError if a file cannot be written, or exists and may not be replaced."""
         for table in (self.keyframes, self._next):
             if table.exists() and not overwrite:
                 raise VideoError(f"{table} exists already: pass --overwrite, or another --output")

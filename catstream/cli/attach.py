@@ -28,12 +28,12 @@ from catstream.processes.job import Job
 from catstream.processes.state import learned
 from catstream.wire.channels import PUBLIC
 
-_SILENT_SECONDS = 3 * REASON_SECONDS  # after which `watch` and `sink` say why
-_OLD_SECONDS = 5.0  # age of the newest message from which they say that the reader is slow
+_SILENT_SECONDS = 3 * REASON_SECONDS  # without a message, after which `watch` and `sink` print the reason
+_OLD_SECONDS = 5.0  # age of a message from which they warn that they lag
 
 
 def _not_empty(_: click.Context, parameter: click.Parameter, text: str | None) -> str:
-    """An option that selects a pipeline: an empty variable of a script must not select the only one that runs."""
+    """Reject an empty value: an empty variable of a script must not select the only running pipeline."""
     if text == "":
         raise click.BadParameter("is empty: pass a value, or omit the option", param=parameter)
     return text or ""
@@ -71,7 +71,7 @@ with_wait = click.option(
 
 
 def wait_for_pipeline(address: Address, seconds: float) -> None:
-    """Wait until a process of the pipeline answers; a terminal shows a status line."""
+    """Wait until a process of the pipeline answers; show a status line on a terminal."""
     from rich.console import Console
 
     with Console(stderr=True).status(f"waiting for a pipeline at {address}"):
@@ -125,7 +125,7 @@ def watch(channel: str, address: Address, wait: float, name: str | None, as_json
 
 
 def with_silence_warnings(messages: Subscription[Any], idle: Callable[[], None] = lambda: None) -> Iterator[Any]:
-    """Yield the messages; warn if they are old, and if none arrives, once for each reason, and call `idle` then."""
+    """Yield the messages; warn once if they are old, and once per reason for silence; call `idle` during a silence."""
     messages.timeout, reason, old, silent = REASON_SECONDS, "", False, 0.0
     while True:
         try:
@@ -141,13 +141,16 @@ def with_silence_warnings(messages: Subscription[Any], idle: Callable[[], None] 
             silent += REASON_SECONDS
             if silent < _SILENT_SECONDS:
                 continue
-            before, reason = reason, re.sub(r"\d+", "", str(error))  # seconds that pass are no other reason
+            before, reason = (
+                reason,
+                re.sub(r"\d+", "", str(error)),
+            )  # the number of seconds does not make another reason
             if reason != before:
                 click.echo(f"waiting: {str(error).replace(f'{REASON_SECONDS:g} s', f'{silent:g} s', 1)}", err=True)
 
 
 def _described(value: bytes | np.ndarray) -> dict[str, object]:
-    """Return a description of a picture or an array, for which JSON has no form."""
+    """Describe a picture or an array, which JSON cannot represent."""
     if isinstance(value, bytes):
         return {"bytes": len(value)}
     norm = float(np.linalg.norm(np.nan_to_num(value)))
@@ -155,7 +158,7 @@ def _described(value: bytes | np.ndarray) -> dict[str, object]:
 
 
 def _line(value: Any) -> str:
-    """The fields of a message that are not empty, after their names; the fields of a nested message in brackets."""
+    """Names and values of the non-empty fields of a message; a nested message is in brackets."""
     if isinstance(value, dict):
         texts = {name: _line(field) for name, field in value.items()}
         texts |= {name: f"({text})" for name, text in texts.items() if isinstance(value[name], dict)}
@@ -168,7 +171,7 @@ def _line(value: Any) -> str:
 
 
 def _control(address: Address, timeout: float) -> Control:
-    """Connect to a pipeline, and print its name."""
+    """Connect to a pipeline, and print its source and endpoint."""
     pipeline = control(address, timeout=timeout)
     if pipeline.source:
         click.echo(f"pipeline: {pipeline.source} at {pipeline.endpoint}", err=True)
@@ -181,7 +184,7 @@ _with_timeout = click.option(
 
 
 def _with_control(command: Callable[..., str]) -> Callable[..., None]:
-    """Add the options that select a pipeline; the command gets a `Control`, and its return value is printed."""
+    """Add the options that select a pipeline; the command receives a `Control`, and its return value is printed."""
 
     @with_address
     @_with_timeout
@@ -201,7 +204,7 @@ def set_box(pipeline: Control, boxes: dict[str, Box], keep: bool) -> str:
     """Set the box of an object, or of several, in a running pipeline.
 
     X,Y,W,H is the box in pixels in the next frame; while a file is paused, in
-    the frame at which it is held. A new NAME adds an object; an existing one is
+    the frame at which it is paused. A new NAME adds an object; an existing one is
     replaced, and its model is dropped. NAME may be omitted if there is only one
     object. Several objects begin in the same frame, or, if a box is invalid, none.
 
@@ -308,9 +311,9 @@ def save(address: Address, timeout: float, file: Path, state: Path | None, name:
     elif str(address):
         raise click.UsageError("--state (the folder of a run) and --endpoint are mutually exclusive")
     else:
-        content = learned(state, Job.load(state).settings, check_name(name))
-        content.save(file)
-        version = content.model.version
+        saved = learned(state, Job.load(state).settings, check_name(name))
+        saved.save(file)
+        version = saved.model.version
     click.echo(f"model {version} is in {file}")
 
 

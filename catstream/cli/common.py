@@ -1,6 +1,6 @@
 """Shared by the commands: tables, errors and progress lines on the terminal, Ctrl-C, and checks of the files to write.
 
-What takes long to import is imported in the functions that need it, in all commands: so `--help` starts faster.
+In all commands, slow imports are in the functions that need them, so that `--help` is fast.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _WIDTH = 140  # columns of a table that is not printed to a terminal
 
 
 def screen() -> Console:
-    """The standard output, for tables."""
+    """The console of standard output, for tables."""
     from rich.console import Console
 
     return Console(width=None if sys.stdout.isatty() else _WIDTH, markup=False, emoji=False)
@@ -47,17 +47,17 @@ def messages() -> Console:
 
 
 def complain(problem: object) -> None:
-    """Print a problem in one line that begins with the name of the program, without passwords of addresses in it."""
+    """Print a problem in a line that begins with the name of the program; passwords in addresses are removed."""
     click.echo(f"catstream: {without_passwords(str(problem))}", err=True)
 
 
-def table(*heads: str, right: Collection[str] = ()) -> Table:
+def table(*headings: str, right: Collection[str] = ()) -> Table:
     """A table without lines, whose columns `right` are aligned to the right."""
     from rich.table import Table
 
     columns = Table(box=None, header_style="bold", pad_edge=False)
-    for head in heads:
-        columns.add_column(head, justify="right" if head in right else "left", overflow="fold")
+    for heading in headings:
+        columns.add_column(heading, justify="right" if heading in right else "left", overflow="fold")
     return columns
 
 
@@ -83,7 +83,7 @@ def line_of(console: Console, *columns: ProgressColumn) -> Progress:
 
 
 def text(form: str, *, last: bool = False) -> TextColumn:
-    """A column of a progress display; the last one gets the room that is left, and is cut in a narrow terminal."""
+    """A column of a progress display; the last one fills the line, and is cut in a narrow terminal."""
     from rich.progress import TextColumn
     from rich.table import Column
 
@@ -110,10 +110,9 @@ class Interrupts:
 
     @contextmanager
     def leaving(self) -> Iterator[None]:
-        """A block in which these signals end this process at once, for imports before any work.
+        """Exit at once on these signals, during imports before any work.
 
-        Kernels are compiled during these imports, and the compiler hides a KeyboardInterrupt or makes another error of
-        it.
+        Kernels are compiled during these imports, and the compiler hides a KeyboardInterrupt, or raises another error.
         """
         self._leaving = True
         try:
@@ -123,7 +122,7 @@ class Interrupts:
 
     @contextmanager
     def deferred(self) -> Iterator[None]:
-        """A block that these signals interrupt at its end only."""
+        """Defer these signals to the end of a block."""
         self._deferring = True
         try:
             yield
@@ -134,7 +133,7 @@ class Interrupts:
             raise KeyboardInterrupt
 
     def end(self) -> None:
-        """Ignore these signals from now on: the process ends, and they would only interrupt its last cleaning up."""
+        """Ignore these signals from now on: they would only interrupt the cleanup of the process."""
         for number in _SIGNALS:
             signal.signal(number, signal.SIG_IGN)
 
@@ -153,13 +152,13 @@ INTERRUPTS = Interrupts()
 
 
 def stopped(result: str = "") -> NoReturn:
-    """End an interrupted command; print the results so far, and how to continue."""
+    """End an interrupted command; print where the results are, or how to continue."""
     click.echo(f"stopped: {result}" if result else "stopped", err=True)
     raise SystemExit(INTERRUPTS.exit_code)
 
 
 def _with_file(name: str, suffix: str, help: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """An option for a file to write, which is checked before the work; only a file with the suffix is replaced."""
+    """An option for an output file, which is checked before the work; only a file with the suffix is replaced."""
 
     def checked(_: click.Context, __: click.Parameter, file: Path | None) -> Path | None:
         from catstream.base.files import check_file

@@ -1,4 +1,4 @@
-"""`catstream export`: other formats from the log of a run."""
+"""`catstream export`: converts the log of a run to other formats."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ def export(
         logs = [JoinedLog(logs)]
     if not form.suffix:
         classes = classes or [*dict.fromkeys(name for content in logs for name in classes_of(content, label))]
-        if dest.absolute().parent.is_dir():  # another export into this folder waits
+        if dest.absolute().parent.is_dir():  # another export into this folder then waits
             click.get_current_context().with_resource(locked_folder(dest.absolute().parent, VideoError, math.inf))
     for file in files:
         exports.check_export(dest, form, overwrite=overwrite, log=file)
@@ -116,25 +116,27 @@ def export(
             click.echo(f"{path} lacks {counted(content.gap, 'frame')}, as the disk was full", err=True)
 
 
-def _with_source(about: About, log: Path, given: str | None, *, required: bool, useful: bool) -> About:
-    """Add what the source tells: the size of the frames, their number, and its images.
+def _with_source(about: About, log: Path, override: str | None, *, required: bool, useful: bool) -> About:
+    """Add the size of the frames, their number, and the images from the source.
 
-    given     path of the source; None for the source that the log states
+    override  path of the source; None for the source that the log states
     required  whether the images are written
     useful    whether the format refers to them
     """
-    source, size = given or about.header.source, about.header.size
+    source, size = override or about.header.source, about.header.size
     if required and (not source or is_live(source)):
         raise VideoError(f"{log} names no source with images: pass --source, or omit --images")
-    if given or (useful and source and not is_live(source)):
+    if override or (useful and source and not is_live(source)):
         try:
             with open_source(source) as opened:
-                if given and size not in (None, opened.size):
-                    raise VideoError(f"{log} has frames of {size}, not {opened.size} as {given}: pass another --source")
+                if override and size not in (None, opened.size):
+                    raise VideoError(
+                        f"{log} has frames of {size}, not {opened.size} as {override}: pass another --source"
+                    )
                 size = size or opened.size
                 about = replace(about, frames=opened.frames, images=opened.images, source=source if required else "")
         except VideoError as error:
-            if given:
+            if override:
                 raise
             if required or Path(source).suffix.lower() not in VIDEOS:  # the images of a folder have names
                 raise VideoError(f"{error} (if it was moved, pass --source)") from None

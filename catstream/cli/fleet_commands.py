@@ -30,8 +30,8 @@ from catstream.wire.messages import FleetStatus, StreamStatus
 if TYPE_CHECKING:
     from catstream.fleet.fleet import Fleet
 
-UP_SECONDS = 120.0  # limit for the streams to start, after which `up` waits no longer
-_SHOW_SECONDS = 0.5  # between two pictures of the status
+UP_SECONDS = 120.0  # timeout of `up` for the start of the streams
+_SHOW_SECONDS = 0.5  # interval of updates of the status
 _STARTED = ("running", "lost", "waiting", "paused", "ended", "failed")
 
 
@@ -54,7 +54,7 @@ def fleet() -> None:
 
 
 def with_fleet(command: Callable[..., None]) -> Callable[..., None]:
-    """Add the options that select a fleet by its controller; the command gets it, connected, as its first argument."""
+    """Add the options that select a fleet by its controller; the command receives the connected fleet first."""
 
     @click.option(
         "--name", "fleet_name", default="", metavar="NAME", help="Name of the fleet; not needed if only one runs here."
@@ -123,7 +123,7 @@ def _down(fleet: Fleet) -> None:
 
 
 def _watch(console: Console, fleet: Fleet) -> None:
-    """Show the streams until all have started; of a fleet that this program has started, until its end."""
+    """Show the streams until all have started, or, if this program has started the fleet, until the fleet ends."""
     deadline = time.monotonic() + UP_SECONDS
     status = fleet.status()
     try:

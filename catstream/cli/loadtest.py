@@ -128,8 +128,8 @@ def loadtest(
     --warm-up. The last line is the verdict. The exit status is 0 if the load was
     sustained (no stream failed, and all limits are met), 1 if it was not, and 2
     if the arguments are invalid. With --find, the load test searches for the
-    highest number that is sustained in two runs, starting with the given one. The
-    limits of subscribers then are subscriber-p99=0.1 and subscriber-missed=0 too.
+    highest number that is sustained in two runs, starting with the given one; for
+    subscribers, the default limits include subscriber-p99=0.1 and subscriber-missed=0.
 
     \b
     EXAMPLES
@@ -169,13 +169,13 @@ def loadtest(
     for number, reason in load_test.refused.items():
         click.echo(f"{number} did not start: {reason}")
     if load_test.results:
-        made = provenance(["catstream", *sys.argv[1:]])
+        origin = provenance(["catstream", *sys.argv[1:]])
         _print_run(load_test.result, parsed)
-        write_json(json_file, to_json(load_test, made))
+        write_json(json_file, to_json(load_test, origin))
         if raw_file is not None:
             write_raw(raw_file, load_test.result)
         if report_file is not None:
-            click.echo(f"report: {write_report(report_file, load_test, made)}")
+            click.echo(f"report: {write_report(report_file, load_test, origin)}")
         click.echo(verdict(load_test))
     if load_test.interrupted:
         stopped("these are the results so far" if load_test.results else "there are no measurements yet")

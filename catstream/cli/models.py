@@ -1,4 +1,4 @@
-"""`catstream find` and `merge`: find the objects of saved models, and make one saved model of several."""
+"""`catstream find` and `merge`: search videos for the objects of saved models, and merge saved models."""
 
 from __future__ import annotations
 
@@ -69,12 +69,12 @@ def find(
 
     search = Search(load_models(models), threshold, every)
     files = find_files(paths)
-    columns = text("file {task.completed}/{task.total}  {task.fields[place]}  {task.description}", last=True)
+    columns = text("file {task.completed}/{task.total}  {task.fields[position]}  {task.description}", last=True)
     interrupted = False
     with SearchResults(output, search.digest, overwrite=overwrite) as results:
         try:
             with one_thread(opencv=True), line_of(messages(), columns) as progress:
-                task = progress.add_task("", total=len(files), place="")
+                task = progress.add_task("", total=len(files), position="")
                 for number, file in enumerate(files):
                     if results.has(file):
                         continue
@@ -82,8 +82,8 @@ def find(
                     try:
                         for frame, detections in search.file(file, result.problems):
                             result.add(frame, detections)
-                            place = f"{clock(frame.time)}, {counted(len(result.intervals), 'interval')}"
-                            progress.update(task, completed=number, description=file.path.name, place=place)
+                            position = f"{clock(frame.time)}, {counted(len(result.intervals), 'interval')}"
+                            progress.update(task, completed=number, description=file.path.name, position=position)
                     except VideoError as error:
                         result.problems.append(str(error))
                     with INTERRUPTS.deferred():
@@ -91,17 +91,17 @@ def find(
         except KeyboardInterrupt:
             interrupted = True
         with INTERRUPTS.deferred():
-            found = list(results.files.values())
-            intervals = [interval for result in found for interval in result.intervals]
+            searched = list(results.files.values())
+            intervals = [interval for result in searched for interval in result.intervals]
             write_detections(output / "detections.csv", intervals)
             intervals.sort(key=lambda interval: -interval.best.score)
-            report = write_report(output / "report.html", search.models, found, intervals)
+            report = write_report(output / "report.html", search.models, searched, intervals)
 
     _print(intervals)
     click.echo(f"report: {report}" if intervals else f"no detections; report: {report}")
     if interrupted:
         stopped("the results of the searched files are saved; the same command continues")
-    problems = [problem for result in found for problem in result.problems]
+    problems = [problem for result in searched for problem in result.problems]
     for problem in problems:
         complain(problem)
     if problems:

@@ -1,7 +1,7 @@
 """The parameter types and options that several commands share, each with one help text.
 
-The first part are decorators of one option. Those after it add several options that belong together, and pass them on
-as one argument of the command's function.
+The decorators of the first part add one option. The others add several options, and pass them on as one argument of
+the command's function.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ FOLDER = click.Path(path_type=Path, file_okay=False)
 
 
 class NumberRange(click.FloatRange):
-    """A number within bounds; NaN is none, although it is neither below nor above any bound."""
+    """A number within bounds; rejects NaN, which is neither below nor above a bound."""
 
     def convert(self, value: Any, parameter: click.Parameter | None, context: click.Context | None) -> float:
         number: float = super().convert(value, parameter, context)
@@ -48,7 +48,7 @@ with_keys = click.option(
 
 
 def _collect(flag: str, convert: _Converter) -> Callable[..., object]:
-    """A callback for texts [NAME=]VALUE; the argument is what `convert` makes of the values by name."""
+    """A callback that collects texts [NAME=]VALUE by name, and returns the result of `convert`."""
 
     def by_name(_: click.Context, __: click.Parameter, texts: tuple[str, ...]) -> object:
         values: dict[str, str] = {}
@@ -65,13 +65,13 @@ def _collect(flag: str, convert: _Converter) -> Callable[..., object]:
 
 
 def _by_name(flag: str, argument: str, metavar: str, convert: _Converter, help: str) -> Decorator:
-    """An option for objects, which may be repeated."""
+    """A repeatable option for objects."""
     callback = _collect(f"{flag} ", convert)
     return click.option(flag, argument, multiple=True, metavar=metavar, callback=callback, help=help)
 
 
 def with_files(flag: str, argument: str, help: str) -> Decorator:
-    """Add an option [NAME=]FILE, which may be repeated, as a dict of files by the names of the objects."""
+    """Add a repeatable option [NAME=]FILE, as a dict of files by object."""
     return _by_name(flag, argument, "[NAME=]FILE", lambda files: {name: Path(files[name]) for name in files}, help)
 
 
@@ -87,15 +87,15 @@ _with_box = _by_name("--box", "boxes", "[NAME=]X,Y,W,H", boxes_by_name, _HELP)
 
 
 def with_object(command: Command) -> Command:
-    """Add `--box` and `--model`, which may be repeated, as the arguments `boxes` and `models`: dicts by name."""
+    """Add the repeatable options `--box` and `--model`, as the arguments `boxes` and `models`: dicts by name."""
     return _with_box(with_model(command))
 
 
 def combined(argument: str, value: Callable[..., object], *options: Decorator) -> Decorator:
-    """Add options, and pass on what `value` makes of them as one argument.
+    """Add options, and pass on the result of `value` as one argument.
 
-    The parameters of `value` are the names of the options; one of them may be an argument that another decorator, above
-    this one or among `options`, passes on.
+    The parameters of `value` are the names of the options, or of the argument of another `combined` decorator above
+    this one or among `options`.
     """
     names = list(signature(value).parameters)
 
@@ -131,7 +131,7 @@ with_overrides = combined(
     click.option("--set", "pairs", multiple=True, metavar="GROUP.NAME=VALUE", help="Set one setting; repeatable."),
 )
 
-#: Adds the same options, as the argument `settings`: all settings, the others by default.
+#: Adds the same options, as the argument `settings`: all settings, with defaults for the others.
 with_settings = combined("settings", lambda overrides: Settings.from_values(overrides), with_overrides)
 
 

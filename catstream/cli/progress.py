@@ -39,20 +39,21 @@ class RunProgress:
 
     def __init__(self, pipeline: Pipeline) -> None:
         self._pipeline = pipeline
-        self._held, self._looked = 0.0, time.perf_counter()  # seconds while the run was held, and until when
+        self._paused_seconds = 0.0  # without tracking: paused, without a box, or without the source
+        self._updated = time.perf_counter()
         self._started = self._now()
-        self._first, self._refreshed = 0.0, self._looked
+        self._first, self._refreshed = 0.0, self._updated
         self.frames = self.not_written = 0
         self._objects: dict[str, _ObjectCounts] = {}
         self._tracks: Mapping[str, Track] = {}  # of the newest frame
 
     def _now(self) -> float:
-        """A clock, in seconds, which stands still while the run is paused, waits for a box, or has lost its source."""
-        return self._looked - self._held
+        """A clock, in seconds, that pauses while the run is paused, waits for a box, or has lost its source."""
+        return self._updated - self._paused_seconds
 
     def count(self, tracks: Mapping[str, Track]) -> None:
         """Count the tracks of a frame."""
-        self._looked, self._tracks = time.perf_counter(), tracks
+        self._updated, self._tracks = time.perf_counter(), tracks
         self._first = self._first or self._now() - self._started
         self.frames += 1
         for name, track in tracks.items():
@@ -62,16 +63,16 @@ class RunProgress:
             counts.version = track.model_version
 
     def idle(self) -> None:
-        """Note a moment without a frame."""
-        before, self._looked = self._looked, time.perf_counter()
+        """Update the clock while there is no frame."""
+        before, self._updated = self._updated, time.perf_counter()
         if self._pipeline.holding:
-            self._held += self._looked - before
+            self._paused_seconds += self._updated - before
 
     def show(self, status: Status, console: Console) -> None:
         """Update the line on a terminal, at most ten times a second; else print it at times, but not of a camera."""
-        if self._looked - self._refreshed < (REFRESH_SECONDS if console.is_terminal else LINE_SECONDS):
+        if self._updated - self._refreshed < (REFRESH_SECONDS if console.is_terminal else LINE_SECONDS):
             return
-        self._refreshed = self._looked
+        self._refreshed = self._updated
         if console.is_terminal:
             from rich.text import Text
 
@@ -80,7 +81,7 @@ class RunProgress:
             console.print(self.line())
 
     def line(self) -> str:
-        """The state of the objects, or why they have none, and figures of the newest frame."""
+        """The state of the objects and the run, with figures of the newest frame."""
         pipeline, tracks = self._pipeline, self._tracks
         if pipeline.holding or not tracks:
             lost = pipeline.lost_seconds

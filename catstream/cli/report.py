@@ -26,7 +26,7 @@ def report(files: tuple[Path, ...], skip_damaged: bool, scale: str, overwrite: b
     report.html in the folder.
 
     The page shows a timeline of each object, distance and speed, and the frames to
-    look at. PAGE-objects.csv, beside it, has the table of all objects. The video
+    look at. PAGE-objects.csv, next to it, has the table of all objects. The video
     is read for the pictures; without it, the page has none.
 
     \b

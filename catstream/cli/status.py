@@ -51,7 +51,7 @@ class Status(msgspec.Struct):
         self.ok = len(self.processes) == len(_PROCESSES)
 
     def lines(self) -> Iterator[tuple[str, str]]:
-        """Yield name and text of each line for people."""
+        """Yield the name and the text of each line."""
         yield "pipeline", self.endpoint
         if "detector" in self.processes:
             counters = self.processes["detector"].counters
@@ -67,7 +67,7 @@ class Status(msgspec.Struct):
             if not_written := counters.get("not_written"):
                 yield "results", f"{counted(int(not_written), 'frame')} not written"
         if "compressor" in self.processes and "bytes" in (trees := self.processes["compressor"].counters):
-            size = f"{trees['bytes'] / 1e6:.1f} MB"  # there are none before the first box
+            size = f"{trees['bytes'] / 1e6:.1f} MB"  # without trees before the first box
             yield (
                 "trees",
                 f"{trees['leaves']:.0f} leaves, {trees['nodes']:.0f} nodes, level {trees['level']:.0f}, {size}",
@@ -102,37 +102,37 @@ def status(address: Address, as_json: bool, wait: float) -> None:
       catstream status --endpoint run --json
     """
     address = address.with_endpoint()
-    found = _collect(address, wait)
+    pipeline = _collect(address, wait)
     if as_json:
-        click.echo(msgspec.json.encode(found))
-    elif found.processes:
-        click.echo("\n".join(f"{name:10} {line}" for name, line in found.lines()))
-        _print_objects(found)
-    if not found.ok:
-        problem = "" if found.processes else f": {address.resolve().hint()}"
-        silent = ", ".join(name for name in _PROCESSES if name not in found.processes)
+        click.echo(msgspec.json.encode(pipeline))
+    elif pipeline.processes:
+        click.echo("\n".join(f"{name:10} {line}" for name, line in pipeline.lines()))
+        _print_objects(pipeline)
+    if not pipeline.ok:
+        problem = "" if pipeline.processes else f": {address.resolve().hint()}"
+        silent = ", ".join(name for name in _PROCESSES if name not in pipeline.processes)
         complain(f"no health report at {address} within {wait:g} s from: {silent}{problem}")
         sys.exit(1)
 
 
 def _collect(address: Address, seconds: float) -> Status:
     """Collect reports until there are two of the detector, for its rate, and one of each other process."""
-    clock, found = RunningClock(), Status(str(address))
+    clock, pipeline = RunningClock(), Status(str(address))
     with subscribe(address, "health") as health:
-        while not found.ok or found.frames_per_second is None:
+        while not pipeline.ok or pipeline.frames_per_second is None:
             if (remaining := seconds - clock()) <= 0:
                 break
             health.timeout = min(remaining, STEP_SECONDS)
             with suppress(SilenceError):
                 if (report := next(health, None)) is None:
                     break
-                found.add(report)
-    return found
+                pipeline.add(report)
+    return pipeline
 
 
-def _print_objects(found: Status) -> None:
+def _print_objects(pipeline: Status) -> None:
     """Print a table of the objects, if they have names."""
-    by_process = {name: report.objects for name, report in found.processes.items()}
+    by_process = {name: report.objects for name, report in pipeline.processes.items()}
     objects, trees = by_process.get("detector", {}), by_process.get("compressor", {})
     if not any(objects):
         return

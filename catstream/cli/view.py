@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from catstream.web.server import Server
     from catstream.web.wall import Wall
 
-#: The port of the page if none is given.
+#: Default port of the page.
 PORT = 8000
 
 _LARGEST_PORT = 65535
@@ -27,7 +27,7 @@ _ATTEMPTS = 100  # ports of PORT+
 
 
 class HostPort(NamedTuple):
-    """The address on which the web server listens, on the next ports if it is in use and there are `attempts`."""
+    """The address on which the web server listens; if its port is in use, it tries up to `attempts` ports."""
 
     host: str
     port: int
@@ -53,12 +53,12 @@ class HostPortType(click.ParamType):  # type: ignore[type-arg]  # generic since 
         return HostPort(host.removeprefix("[").removesuffix("]") or "127.0.0.1", int(port), attempts)
 
 
-#: In the place of a token: every user of this machine may use the page.
+#: Replaces a token: every user of this machine may use the page.
 _OPEN = "none"
 
 
 def _token_of_user() -> str:
-    """The token of this user, which is made once, so that links stay valid; a new one if it cannot be kept."""
+    """The stored token of this user, so that links stay valid; a new one each time if it cannot be stored."""
     token = secrets.token_hex(16)
     try:
         file = state_home() / "view-token"
@@ -67,7 +67,7 @@ def _token_of_user() -> str:
             return file.read_text(encoding="ascii").strip()
         file.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         write_atomically(file, f"{token}\n".encode(), mode=0o600)
-    except (OSError, ServiceError, ValueError):  # no home, no permission, or a file with other content
+    except (OSError, ServiceError, ValueError):  # no home directory, no permission, or a file with other content
         pass
     return token
 

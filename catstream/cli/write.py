@@ -31,7 +31,7 @@ _REPORTS = 12  # health reports of all processes in four seconds, one of which i
 
 
 def with_table(rows: Mapping[str, Any]) -> Callable[[Command], Command]:
-    """Replace {table} in the help of a command by the lines of the destinations, or of the formats."""
+    """Replace {table} in the help of a command by a table of destinations or formats."""
 
     def changed(command: Command) -> Command:
         lines = (f"  {key:9} {row.meaning}" for key, row in rows.items())
@@ -42,7 +42,7 @@ def with_table(rows: Mapping[str, Any]) -> Callable[[Command], Command]:
 
 
 def _texts(_: click.Context, __: click.Parameter, pairs: tuple[str, ...]) -> dict[str, str] | None:
-    """The texts NAME=TEXT by name; None if there is none."""
+    """The texts NAME=TEXT by name, or None."""
     texts = dict(map(split_name, pairs))
     if "" in texts or len(texts) < len(pairs):
         raise click.BadParameter(f"expected NAME=TEXT, each with a new name, got {pairs[-1]!r}")
@@ -54,7 +54,7 @@ def _flag(name: str) -> str:
 
 
 def _with_options(command: Command) -> Command:
-    """Add the options of destinations; the argument `values` has the given ones by name."""
+    """Add the options of destinations, as the argument `values`: a dict of the passed ones by name."""
 
     @wraps(command)
     def wrapped(**arguments: Any) -> object:
@@ -74,7 +74,7 @@ def _with_options(command: Command) -> Command:
 
 
 def _header(address: Address) -> Header:
-    """The header of a log, as far as the detector of the pipeline reports the run."""
+    """The header of a log, from the health reports of the detector."""
     header = Header()
     with subscribe(address, "health", timeout=ANSWER_SECONDS) as reports, suppress(SilenceError):
         for report in islice(reports, _REPORTS):
@@ -135,7 +135,7 @@ def sink(destinations: tuple[str, ...], values: dict[str, Any], address: Address
                 if tracks.run != run and not address.stream:  # a stream of a fleet may move
                     reason = ": the run had no end, and another one started"
                     break
-                # A restarted detector repeats some frames; a track that was missed before is not written out of order.
+                # Skip frames that a restarted detector repeats, even if their track was missed: order matters.
                 if track.frame < max(newest.values(), default=-1) or track.frame == newest.get(track.object):
                     continue
                 with INTERRUPTS.deferred():  # a track is written everywhere or nowhere
