@@ -1,4 +1,4 @@
-"""Owns the coreset trees: features in, samples out: `python services/compressor.py --help`."""
+"""Inserts features into the coreset trees, and publishes samples: see `python services/compressor.py --help`."""
 
 from catstream.processes.by_hand import main
 

@@ -1,4 +1,4 @@
-"""Tracks the objects in each frame; sends tracks and features: `python services/detector.py --help`."""
+"""Tracks the objects in each frame, and sends tracks and features: see `python services/detector.py --help`."""
 
 from catstream.processes.by_hand import main
 

@@ -1,4 +1,4 @@
-"""Trains a model on each sample: `python services/trainer.py --help`."""
+"""Trains a model on each sample: see `python services/trainer.py --help`."""
 
 from catstream.processes.by_hand import main
 

@@ -92,12 +92,7 @@ class Box(_Rectangle):
 
     @classmethod
     def parse(cls, value: str | Iterable[float]) -> Box:
-        """Make a box from four numbers or from a text `x,y,w,h`, separated by commas, blanks or tabs.
-
-        Raises
-        ------
-        BoxError
-            If the value is not four numbers.
+        """Make a box from four numbers, or a text `x,y,w,h` with commas, blanks or tabs; BoxError otherwise.
 
         Examples
         --------
@@ -128,13 +123,7 @@ class Box(_Rectangle):
         return left, top, max(right - left, 1), max(bottom - top, 1)
 
     def checked(self) -> Box:
-        """Return the box unchanged if its numbers are finite and it is at least 2 pixels wide and high.
-
-        Raises
-        ------
-        BoxError
-            If it is not.
-        """
+        """Return the box unchanged; BoxError if a number is not finite, or a side is shorter than 2 pixels."""
         if not all(math.isfinite(value) for value in self):
             raise BoxError(f"a box needs four finite numbers, got {self}: pass x,y,w,h in pixels")
         if self.w < 2 or self.h < 2:
@@ -144,10 +133,7 @@ class Box(_Rectangle):
     def validated(self, width: int, height: int) -> Box:
         """Return the box unchanged if tracking can start with it in a frame of this size.
 
-        Raises
-        ------
-        BoxError
-            If `checked` fails, the box is more than twice as wide or high as the frame, or its centre lies outside it.
+        BoxError if `checked` fails, the box is more than twice as wide or high as the frame, or its centre is outside.
         """
         self.checked()
         # With its centre inside the frame, such a box covers the whole frame: it does not select an object.

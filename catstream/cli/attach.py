@@ -206,7 +206,7 @@ def set_box(pipeline: Control, boxes: dict[str, Box], keep: bool) -> str:
     X,Y,W,H is the box in pixels in the next frame; while a file is paused, in
     the frame at which it is paused. A new NAME adds an object; an existing one is
     replaced, and its model is dropped. NAME may be omitted if there is only one
-    object. Several objects begin in the same frame, or, if a box is invalid, none.
+    object. Several objects begin in the same frame; an invalid box rejects all.
 
     \b
     EXAMPLES

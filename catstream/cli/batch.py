@@ -65,6 +65,7 @@ def batch(
     with INTERRUPTS.leaving():
         from catstream.batch import Batch, check_results, read_videos
 
+    # Step 1: read the table, and lock the folder of the results.
     settings = Settings.from_values(overrides)
     videos = read_videos(boxes)
     if not videos:
@@ -76,6 +77,7 @@ def batch(
     jobs, total, console = jobs or cores(), len(batch.missing), messages()
     if not console.is_interactive:
         console.print(f"tracking {counted(total, 'video')}, {len(videos) - total} complete")
+    # Step 2: track the missing videos.
     began = time.monotonic()
     try:
         with line_of(console) as progress, closing(batch.track(settings, jobs)) as tracked:
@@ -89,6 +91,7 @@ def batch(
                     console.print(f"{state}: {row.video}: {row.error or present}")
     except KeyboardInterrupt:
         stopped("the results so far are saved; the same command continues")
+    # Step 3: print the rows of all videos.
     summaries = [batch.rows[video.file] for video in videos if video.file in batch.rows]
     _print(summaries)
     click.echo(f"results: {output}")

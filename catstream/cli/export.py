@@ -86,6 +86,7 @@ def export(
       catstream export out/gate*.ndjson gate.csv
       catstream export out/walk.ndjson dataset --format yolo --images --classes dog,cat
     """
+    # Step 1: check the options, and find the logs.
     form = exports.export_of(dest, name)
     if classes and not form.sized:
         raise click.UsageError("--classes requires a format with classes: coco, cvat or yolo")
@@ -94,12 +95,14 @@ def export(
     logs = logs_of(files, skip_damaged=skip_damaged)
     if form.suffix and len(logs) > 1:
         logs = [JoinedLog(logs)]
+    # Step 2: for a folder, number the classes of all logs, and lock it.
     if not form.suffix:
         classes = classes or [*dict.fromkeys(name for content in logs for name in classes_of(content, label))]
         if dest.absolute().parent.is_dir():  # another export into this folder then waits
             click.get_current_context().with_resource(locked_folder(dest.absolute().parent, VideoError, math.inf))
     for file in files:
         exports.check_export(dest, form, overwrite=overwrite, log=file)
+    # Step 3: convert each log, with facts from its source.
     for content in logs:
         path = content.path
         about = About(

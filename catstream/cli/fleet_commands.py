@@ -25,7 +25,7 @@ from catstream.cli.options import PATH, with_json
 from catstream.cli.view import HostPort, fleet_view, server_of, with_view
 from catstream.client.address import Address
 from catstream.errors import FleetError
-from catstream.wire.messages import FleetStatus, StreamStatus
+from catstream.wire.messages import FleetStatus
 
 if TYPE_CHECKING:
     from catstream.fleet.fleet import Fleet
@@ -129,7 +129,8 @@ def _watch(console: Console, fleet: Fleet) -> None:
     try:
         with Live(console=console, transient=True) as live:
             while fleet.is_owner or (
-                time.monotonic() < deadline and not all(map(_has_started, status.streams.values()))
+                time.monotonic() < deadline
+                and not all(stream.state in _STARTED or stream.trouble for stream in status.streams.values())
             ):
                 live.update(Group(*_tables(status)))
                 time.sleep(_SHOW_SECONDS)
@@ -140,10 +141,6 @@ def _watch(console: Console, fleet: Fleet) -> None:
         click.echo(f"the fleet {fleet.name} was ended from elsewhere")
     finally:
         console.print(*_tables(status), sep="\n")
-
-
-def _has_started(stream: StreamStatus) -> bool:
-    return stream.state in _STARTED or bool(stream.trouble)
 
 
 @fleet.command()

@@ -67,6 +67,7 @@ def find(
         from catstream.offline.find_results import FileResult, SearchResults, write_detections, write_report
         from catstream.output.report import clock
 
+    # Step 1: search each file that has no result yet, and store its result.
     search = Search(load_models(models), threshold, every)
     files = find_files(paths)
     columns = text("file {task.completed}/{task.total}  {task.fields[position]}  {task.description}", last=True)
@@ -90,6 +91,7 @@ def find(
                         results.add(result)
         except KeyboardInterrupt:
             interrupted = True
+        # Step 2: write the report about all results, even after Ctrl-C.
         with INTERRUPTS.deferred():
             searched = list(results.files.values())
             intervals = [interval for result in searched for interval in result.intervals]

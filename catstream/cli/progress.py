@@ -131,7 +131,7 @@ class RunProgress:
         files = [self._pipeline.results.output, *(self._pipeline.results.write or ())]
         if results := [str(file) for file in files if file is not None and file.exists()]:
             here = f"{Path.cwd()}/"
-            lines.append(f"results: {', '.join(place.removeprefix(here) for place in results)}")
+            lines.append(f"results: {', '.join(path.removeprefix(here) for path in results)}")
         return "\n".join(lines)
 
     @property

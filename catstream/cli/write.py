@@ -114,6 +114,7 @@ def sink(destinations: tuple[str, ...], values: dict[str, Any], address: Address
       catstream sink mqtt://10.0.0.7/yard --zone "door=300,80 420,80 420,400 300,400"
       catstream sink https://example.com/hook events/ --when lost=10,entered
     """
+    # Step 1: check the options and the destinations.
     try:
         options = parse(values, destinations, _flag)
     except SettingsError as error:
@@ -125,11 +126,13 @@ def sink(destinations: tuple[str, ...], values: dict[str, Any], address: Address
     address = address.with_endpoint()
     with subscribe(address, "tracks") as tracks:
         with suppress(KeyboardInterrupt), ExitStack() as stack:
+            # Step 2: wait for the pipeline, whose reports have the header of the log.
             wait_for_pipeline(address, wait)
             origin = Origin(_header(address), address, options, attached=True)
             check_zones(options.zone, origin.header.size)
             outputs = stack.enter_context(replace(files, origin=origin).continued(address.endpoint, resume=False))
             status = stack.enter_context(Console(stderr=True).status("waiting for a track"))
+            # Step 3: write each new track.
             for track in with_silence_warnings(tracks, outputs.idle):
                 run = run or tracks.run
                 if tracks.run != run and not address.stream:  # a stream of a fleet may move

@@ -1,10 +1,5 @@
 """Send commands to a running pipeline: set a box, search for an object, forget one, pause, resume, save, stop.
 
-    import catstream
-
-    with catstream.control("run") as control:
-        control.set_box((120, 80, 64, 48), "anna")
-
 A command is resent until it is answered, and is executed once.
 """
 
@@ -96,11 +91,7 @@ class Control(AbstractContextManager["Control"]):
         The model, or its file on this machine, is sent to the pipeline, which stores a copy. The object is absent until
         it is found in the whole frame, and training continues from the saved model. An object that has this name is
         replaced, and its model is dropped.
-
-        Raises
-        ------
-        ServiceError, ProtocolError
-            If the file cannot be read, or is not a saved model.
+        ServiceError or ProtocolError if the file cannot be read, or is not a saved model.
         """
         saved = model if isinstance(model, SavedModel) else SavedModel.load(model)
         return self.execute("search", object, model=saved.to_bytes())
@@ -127,10 +118,7 @@ class Control(AbstractContextManager["Control"]):
     def save(self, path: str | os.PathLike[str], object: str = UNNAMED) -> Answer:
         """Save the model and the coreset trees of an object to a local file, which `catstream.SavedModel` reads.
 
-        Raises
-        ------
-        ServiceError
-            If the file cannot be written.
+        ServiceError if the file cannot be written.
         """
         answer = self.execute("save", object)
         saved = self._newest(answer.object, answer.version)

@@ -38,7 +38,7 @@ class Registry(AbstractContextManager["Registry"]):
         fleet = fleet.removeprefix("fleet://").removeprefix("tcp://").rstrip("/")
         self._name, self._endpoint = _remote(fleet, own) if ":" in fleet else _local(fleet, own)
         self._requester = Requester[Question, Listing](REGISTRY, self._endpoint)
-        self._question = ""  # id of the last question of `request`
+        self._question = ""  # id of the last query of `request`
 
     def streams(self, only: str = "") -> FleetStatus:
         """The state of all streams and nodes, or of one stream."""

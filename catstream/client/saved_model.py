@@ -103,13 +103,7 @@ class SavedModel:
         return Similarity.of(rows, total_energy, tree.sum, tree.rows_seen, mean)
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write one safetensors file, atomically.
-
-        Raises
-        ------
-        ServiceError
-            If it cannot be written.
-        """
+        """Write one safetensors file, atomically; ServiceError if it cannot be written."""
         with writing(path):
             write_atomically(path, self.to_bytes())
 
@@ -132,12 +126,8 @@ class SavedModel:
     def load(cls, path: str | os.PathLike[str]) -> Self:
         """Read the file that `save` wrote.
 
-        Raises
-        ------
-        ServiceError
-            If it does not exist, or cannot be read.
-        ProtocolError
-            If it is damaged, is not a saved model, or has other features.
+        ServiceError if it does not exist, or cannot be read; ProtocolError if it is damaged, is not a saved model, or
+        has other features.
         """
         try:
             data = Path(path).read_bytes()
@@ -253,6 +243,7 @@ def merge(parts: Iterable[SavedModel], *, force: bool = False) -> SavedModel:
         If there are fewer than two, if their settings or names differ, if two contain the same frames, or if their
         objects do not look alike (below 0.25); or if a part is not a `SavedModel`, for example a path.
     """
+    # Step 1: reject parts that are not models of one object with the same settings, from different frames.
     parts = list(parts)
     if wrong := [part for part in parts if not isinstance(part, SavedModel)]:
         raise SettingsError(f"a merge takes saved models, got {wrong[0]!r}: read a file with catstream.SavedModel.load")
@@ -273,6 +264,7 @@ def merge(parts: Iterable[SavedModel], *, force: bool = False) -> SavedModel:
         )
     if not force:
         _check_alike(parts)
+    # Step 2: merge the trees, and train a model from them.
     trees = {name: reduce(CoresetTree.merged, [part.trees[name] for part in parts]) for name in TREES}
     centres = next((part.centres for part in parts if len(part.centres)), first.centres)
     version = max(part.model.version for part in parts)

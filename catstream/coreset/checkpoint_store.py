@@ -56,7 +56,7 @@ class CheckpointStore:
         """
         forest = self._newest(lambda path: Forest.load(path, settings))
         if self._damaged:
-            consequence = f"that of frame {forest.frame} was used" if forest else "training starts again"
+            consequence = f"the checkpoint of frame {forest.frame} was used" if forest else "training starts again"
             self._read_problem = f"damaged checkpoints: {len(self._damaged)}; {consequence}"
             _log.warning("%s", self._read_problem)
         return forest or Forest(settings)
@@ -88,10 +88,11 @@ class CheckpointStore:
             forest.save(path, durable=durable)
             self.size = path.stat().st_size
         except OSError as error:
+            # On a full disk, remove the least valuable checkpoint, and try again.
             by_value = sorted(files, key=lambda file: file not in self._damaged)  # damaged ones first, then by age
             if error.errno in (errno.ENOSPC, errno.EDQUOT) and len(by_value) > 1:
                 with suppress(OSError):
-                    sync(by_value[-1])  # else a power cut might leave none
+                    sync(by_value[-1])  # otherwise, a power failure might leave no checkpoint
                     by_value[0].unlink()
                     self._durable = by_value[-1]
                     self._damaged = [file for file in self._damaged if file != by_value[0]]
@@ -105,6 +106,7 @@ class CheckpointStore:
         if self.write_problem:
             _log.warning("checkpoints are written again")
         self.write_problem = ""
+        # Keep the newest damaged checkpoint for analysis, and remove those that are older than the newest two.
         for damaged in self._damaged:
             damaged.replace(self._folder / _DAMAGED)
         self._damaged = []

@@ -74,11 +74,13 @@ class Forest:
                 f"features {features.seq} follow {self.seq}, {features.seq - self.seq - 1} are missing: "
                 "retransmit all after the last acknowledged one"
             )
+        # Step 1: drop the objects that the message lacks, and add new ones.
         compressors: dict[str, Compressor] = {}
         for name, part in features.objects.items():
             compressor = continued.get(name) if part.begins else self.compressors.get(name)
             compressors[name] = compressor or Compressor(self.settings, name)
         self.compressors = compressors
+        # Step 2: insert the rows of each object.
         samples: list[Sample] = []
         for name, part in features.objects.items():
             compressor = compressors[name]
@@ -178,7 +180,7 @@ class Forest:
         trees = [tree for compressor in self.compressors.values() for tree in compressor.trees.values()]
         if sizes := {tree.size for tree in trees} - {settings.coreset.size}:
             raise SettingsError(
-                f"{path} holds trees of size {max(sizes)}, the settings say {settings.coreset.size}: "
+                f"{path} has trees of size {max(sizes)}, the settings say {settings.coreset.size}: "
                 "continue with the same settings"
             )
         return self

@@ -1,7 +1,6 @@
 """The detector of one object: frames in, tracks and training rows out (paper, "Classification").
 
-The state and the model are all that is kept between frames: with the same settings, they and a frame determine the
-result.
+Its state and model are the only memory between frames: the same state, model, frame and settings give the same result.
 """
 
 from __future__ import annotations

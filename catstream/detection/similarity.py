@@ -1,7 +1,7 @@
 """Similarity: how much of a window's appearance lies in the subspace of the object's earlier appearances.
 
 The score of a model separates the object from the background that it was trained on. In another scene, unrelated
-windows may score high. Distances to subspaces are what a coreset preserves, so they can be measured from it.
+windows may score high. A coreset preserves distances to subspaces, so they can be measured from it.
 """
 
 from __future__ import annotations

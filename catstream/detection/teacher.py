@@ -135,7 +135,7 @@ def training_of_background(context: FrameContext, window: Window, similarity: Si
 
 
 def hard_negatives(context: FrameContext, window: Window) -> TrainingRows:
-    """The windows of the whole frame with the highest scores, except those that overlap the object's window."""
+    """The windows of the frame with the highest scores that do not overlap the object's window."""
     options = context.settings.training
     return _rows(_hardest(context.scores_of_frame(window), window, options.hard_negatives), 0, 1, options)
 
@@ -195,7 +195,7 @@ def affine_copies(
 
 
 def _is_moved(number: int, share: float) -> bool:
-    """Return True if copy `number` gets another background, as a `share` of all copies does; never the first one."""
+    """Return True if copy `number` gets another background, as a `share` of all copies do, but never the first one."""
     return number > 0 and number * share % 1 < share
 
 
@@ -258,7 +258,7 @@ def _appearance(
 def _surroundings(
     around: ScoreMap, window: Window, count: int, hardest: int, rng: np.random.Generator, options: TrainingSettings
 ) -> TrainingRows:
-    """Near misses of a window, and `count` background windows: those with the highest scores, and random ones."""
+    """Near misses of a window, and `count` background windows: `hardest` with the highest scores, and random ones."""
     row, column = around.position(window)
     rows, columns = around.scores.shape
     down = abs(np.arange(rows) - row)

@@ -25,6 +25,10 @@ _MEAN_COLOUR = slice(CHANNELS - 3, CHANNELS)
 #: Limits of a change by the noise of a camera: of a mean colour (9 levels of lightness, 3 of a and b) in all cells but
 #: one in a hundred, and of the squares of all features. Noise of 2 levels in the pixels changes 6 levels and 0.08.
 _NOISE_OF_COLOUR, _CHANGED, _NOISE = 9 * 1.5 / 255, 0.01, 0.1
+_FAR = (np.arange(CELL) + 0.5) / CELL
+_WEIGHTS = [np.outer(down, across) for down in (1 - _FAR, _FAR) for across in (1 - _FAR, _FAR)]
+#: Weights of the bilinear interpolation of a pixel between four cell centres, float32 (8, 8, 4).
+_SHARES = np.stack(_WEIGHTS, axis=-1).astype(np.float32)
 _LOWEST = float(np.finfo(np.float32).min)  # the fast arithmetic of the kernels excludes infinity
 
 
@@ -141,17 +145,6 @@ def grid(planes: np.ndarray, margin: int = 0) -> np.ndarray:
     if cells.size:
         kernels.describe_cells(planes, margin, _SHARES, cells)
     return cells
-
-
-def _shares() -> np.ndarray:
-    """Weights of the bilinear interpolation of a pixel between four cell centres, float32 (8, 8, 4)."""
-    far = (np.arange(CELL) + 0.5) / CELL
-    near = 1 - far
-    shares = [np.outer(down, across) for down in (near, far) for across in (near, far)]
-    return np.stack(shares, axis=-1).astype(np.float32)
-
-
-_SHARES = _shares()
 
 
 def shades(planes: np.ndarray) -> np.ndarray:

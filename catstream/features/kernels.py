@@ -155,6 +155,7 @@ def _count(planes: UInt8, margin: int, shares: Float32, histogram: Float32) -> N
     orientation = np.empty(width + CELL, np.uint8)
     blocks = np.empty((columns + 1, _SIGNED, 4), np.float32)  # each spans the centres of four cells
     inner = slice(margin * CELL, (columns + 1 - margin) * CELL)
+    # Step 1: clear the padding and the bins.
     for x in range(len(magnitude)):
         magnitude[x] = orientation[x] = 0
     for row in range(rows + 2):
@@ -166,6 +167,7 @@ def _count(planes: UInt8, margin: int, shares: Float32, histogram: Float32) -> N
             for o in range(_SIGNED):
                 for share in range(4):
                     blocks[block, o, share] = 0
+        # Step 2: add the pixels of a band to the bins of its blocks, line by line.
         top, bottom = max(band * CELL - _HALF, 0), min(band * CELL + _HALF, height)
         if band == margin:
             _read(planes, max(top - 1, 0), lines[(top + 2) % 3])
@@ -177,6 +179,7 @@ def _count(planes: UInt8, margin: int, shares: Float32, histogram: Float32) -> N
             _orientations(across, down, orientation[_HALF : _HALF + width])
             line = shares[(y + _HALF) % CELL]
             _add(magnitude[inner], orientation[inner], line, blocks[margin : columns + 1 - margin])
+        # Step 3: add the four parts of each block to the four cells around it.
         for block in range(margin, columns + 1 - margin):
             for o in range(_SIGNED):
                 histogram[band, block, o] += blocks[block, o, 0]
@@ -211,6 +214,7 @@ def _colour(planes: UInt8, margin: int, cells: Float32) -> None:
 @function(**_OPTIONS)
 def _normalise(histogram: Float32, margin: int, cells: Float32) -> None:
     """Normalise the histogram of each cell by the energies of the four blocks of 2 x 2 cells around it."""
+    # Step 1: the energy of each cell, over unsigned orientations.
     rows, columns = histogram.shape[0] - 2, histogram.shape[1] - 2
     energy = np.empty((rows, columns), np.float32)
     for row in range(rows):
@@ -221,7 +225,7 @@ def _normalise(histogram: Float32, margin: int, cells: Float32) -> None:
                 both = bins[o] + bins[o + _ORIENTATIONS]
                 total += both * both
             energy[row, column] = total
-
+    # Step 2: the factors of the blocks a, b, c and d, which contain the cell and three neighbours each.
     half, small = float32(0.5), float32(1e-4)
     for row in range(margin, rows - margin):
         up, down = max(row - 1, 0), min(row + 1, rows - 1)
@@ -233,6 +237,7 @@ def _normalise(histogram: Float32, margin: int, cells: Float32) -> None:
             b = float32(1) / np.sqrt(above + energy[up, right] + energy[row, right] + small)
             c = float32(1) / np.sqrt(below + energy[down, left] + energy[row, left] + small)
             d = float32(1) / np.sqrt(below + energy[down, right] + energy[row, right] + small)
+            # Step 3: the signed, then the unsigned orientations, then the texture energy in each block.
             bins = histogram[row + 1, column + 1]
             features = cells[row - margin, column - margin]
             texture_a = texture_b = texture_c = texture_d = float32(0)
@@ -317,6 +322,7 @@ def add_colour_scores(shades: UInt16, weights: Float32, threshold: float, scores
             for y in range(top + (COUNTED - 1) * SIDE if row else top, top + COUNTED * SIDE):
                 for x in range(left, left + SIDE):
                     strip[shades[y, x]] += 1
+        # The histogram of a window is the sum of its strips.
         for shade in range(len(counts)):
             counts[shade] = 0
             for column in range(COUNTED - 1):

@@ -72,6 +72,7 @@ def average(image: UInt8, across: float, down: float, output: UInt8) -> None:
 
     The pixels equal `cv2.INTER_AREA`, which takes twice as long.
     """
+    # Step 1: the pixels that each output row and column covers.
     rows, columns = output.shape[:2]
     below, right = max(3, int(np.ceil(down)) + 1), max(3, int(np.ceil(across)) + 1)
     lines, parts = np.zeros((below, rows), np.uint32), np.zeros((below, rows), np.float32)
@@ -81,7 +82,8 @@ def average(image: UInt8, across: float, down: float, output: UInt8) -> None:
     pixels *= np.uint32(3)  # to indices of a line
     line = np.empty(3 * image.shape[1], np.float32)
     reduced, total = np.empty(3 * columns, np.float32), np.empty(3 * columns, np.float32)
-    ready = -1
+    # Step 2: reduce the covered lines along the row, and add them up by their shares.
+    ready = -1  # the input line that was reduced last
     for row in range(rows):
         for tap in range(below):
             part = parts[tap, row]

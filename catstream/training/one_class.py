@@ -26,12 +26,7 @@ def one_class(rows: np.ndarray, origin: np.ndarray, nu: float = 0.5) -> np.ndarr
 
     Returns
     -------
-    float32 (d,), not normalised
-
-    Raises
-    ------
-    ProtocolError
-        If there are no rows, or none differs from the origin.
+    float32 (d,), not normalised; ProtocolError if no row differs from the origin
 
     >>> direction = one_class(np.array([[3, 1], [3, 2], [3, 0]], np.float32), np.array([1, 1], np.float32))
     >>> (direction / direction[0]).round(3)

@@ -38,8 +38,6 @@ class Colours:
 
     A new object gets the first of the least used colours.
 
-    Examples
-    --------
     >>> colours = Colours()
     >>> [colours.of(name) for name in ("anna", "ben", "anna")]
     ['#ff922b', '#3586ff', '#ff922b']
@@ -110,16 +108,13 @@ def preview_image(preview: Preview, tracks: Sequence[Track], colours: Colours) -
     if not tracks:
         return np.vstack([image, np.full((_text_height(image.shape[1]), image.shape[1], 3), _DARK, np.uint8)])
     scale = image.shape[1] / preview.width
-    return draw(image, [_scaled(track, scale) for track in tracks], colours)
+    boxes = [track.box and Box(*(side * scale for side in track.box)) for track in tracks]
+    return draw(image, [replace(track, box=box) for track, box in zip(tracks, boxes, strict=True)], colours)
 
 
 def outline(image: np.ndarray, box: Box, colour: str, unit: float = 1.0) -> None:
     """Draw a box into an image, in a colour #rrggbb; `unit` is the width of its lines, about one pixel."""
     _draw_box(image, (box.x, box.y), (box.x + box.w, box.y + box.h), _bgr(colour), unit)
-
-
-def _scaled(track: Track, scale: float) -> Track:
-    return replace(track, box=None if track.box is None else Box(*(side * scale for side in track.box)))
 
 
 def _bgr(colour: str) -> _Colour:

@@ -137,7 +137,7 @@ def open_source(
               it, opening a live source never fails: iteration waits for the first frame without a timeout, and the size
               is unknown until then
     settings  the settings of a run; `image_rate`, `hwaccel`, `skip_damaged` and `resize` are used
-    single    values by name that replace those in `settings`
+    single    single settings by name, which override `settings`
 
     VideoError if the source does not exist or cannot be read. The iterator raises it where a frame cannot be decoded.
     """
@@ -182,7 +182,7 @@ def _open_reader(path: Path, settings: RunSettings) -> tuple[str, Images | Video
         if len(videos) == 1:
             return videos[0].stem, VideoFile(videos[0], settings)
         content = f"{len(videos)} videos" if videos else "neither images nor a video"
-        raise VideoError(f"the folder {str(path)!r} holds {content}: {EXPECTED}")
+        raise VideoError(f"the folder {str(path)!r} contains {content}: {EXPECTED}")
     if path.is_file():
         pages = pages_of(path)
         return path.stem, Images(pages, settings) if pages else VideoFile(path, settings)

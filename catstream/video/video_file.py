@@ -125,6 +125,7 @@ class VideoFile:
             if waits_for_key and isinstance(packet, av.Packet) and not packet.is_keyframe:
                 self.damaged += 1
                 continue
+            # Step 1: decode the packet. After an error, fetch the earlier frames, and reset the decoder.
             frames: list[VideoFrame] = []
             problem = packet if isinstance(packet, str) else ""
             try:
@@ -137,6 +138,7 @@ class VideoFile:
                 with contextlib.suppress(av.FFmpegError):  # the decoder still has earlier frames
                     frames = decoder.decode(None)
                 decoder.flush_buffers()
+            # Step 2: yield the intact frames. Damage lasts until the next keyframe.
             for frame in frames:
                 if begin is not None and (frame.pts or 0) < begin:
                     continue

@@ -327,6 +327,7 @@ class _Reader:
                     yield packet
             yield None
 
+        # Cache each frame while it follows the last one.
         for count, frame in enumerate(self._video.decoded(numbered(), begin if index.is_unique else None)):
             number = frame.pts or 0 if index.is_unique else count
             if number < begin:

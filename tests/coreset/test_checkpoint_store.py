@@ -68,7 +68,7 @@ def test_damaged_checkpoint_is_detected_and_the_one_before_used(checkpoints, dam
     newest(checkpoints).write_bytes(damaged(newest(checkpoints).read_bytes()))
     store = CheckpointStore(checkpoints)
     assert CheckpointStore(checkpoints).position()[0] == store.load(SETTINGS).seq == 50
-    assert "damaged checkpoints: 1; that of frame 49 was used" in store.trouble
+    assert "damaged checkpoints: 1; the checkpoint of frame 49 was used" in store.trouble
     assert "cannot be used" in caplog.text
 
 
