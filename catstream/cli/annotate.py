@@ -106,7 +106,9 @@ def annotate(
         _serve(_listed(videos), output, settings, jobs, listen, overwrite=overwrite)
         return
     if len(videos) > 1:
-        raise click.UsageError("boxes are of one video: pass one, or draw them on the page, without --box and --boxes")
+        raise click.UsageError(
+            "--box and --boxes are for one video: pass one, or omit them and draw the boxes on the page"
+        )
     bar = line_of(messages())
     with Annotation(
         videos[0], drawn, settings, jobs=jobs, progress=lambda *done: show_progress(bar, *done)

@@ -91,14 +91,13 @@ def text(form: str, *, last: bool = False) -> TextColumn:
 
 
 class Interrupts:
-    """Raises KeyboardInterrupt for Ctrl-C, SIGTERM and the loss of the terminal, except in the blocks below.
-
-    exit_code  of a command that was interrupted, as a shell reports the signal: 130 for Ctrl-C, 143 for SIGTERM
-    """
+    """Raises KeyboardInterrupt for Ctrl-C, SIGTERM and the loss of the terminal, except in the blocks below."""
 
     def __init__(self) -> None:
         self._leaving = self._deferring = self._pending = False
-        self.exit_code = 128 + signal.SIGINT
+        self.exit_code = (
+            128 + signal.SIGINT
+        )  #: of an interrupted command, as of a shell: 130 for Ctrl-C, 143 for SIGTERM
 
     def install(self) -> None:
         """Install the handlers. A signal that is ignored, as under nohup, stays ignored, except SIGTERM."""

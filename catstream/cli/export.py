@@ -116,7 +116,7 @@ def export(
         if content.damaged:
             click.echo(f"{counted(content.damaged, 'damaged line')} of {path} skipped", err=True)
         if content.gap:
-            click.echo(f"{path} lacks {counted(content.gap, 'frame')}, as the disk was full", err=True)
+            click.echo(f"{path} lacks {counted(content.gap, 'frame')} (the disk was full)", err=True)
 
 
 def _with_source(about: About, log: Path, override: str | None, *, required: bool, useful: bool) -> About:

@@ -57,7 +57,7 @@ def report(files: tuple[Path, ...], skip_damaged: bool, scale: str, overwrite: b
     write_report(page, table, sections)
     for section in sections:
         if section.gap:
-            complain(f"{section.name}: the log lacks {counted(section.gap, 'frame')}, as the disk was full")
+            complain(f"{section.name}: the log lacks {counted(section.gap, 'frame')} (the disk was full)")
         if section.problem:
             complain(f"{section.name}: no pictures ({section.problem})")
     click.echo(f"report: {page}, {table}")

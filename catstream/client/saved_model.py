@@ -53,7 +53,7 @@ class SavedModel:
     origins   digest of the first training rows of each stream that the trees contain
     box       last box of the object in pixels; only its size matters in another video
     model     trained from the trees; its frame is 0
-    settings  that the trees and the model were made with
+    settings  of the run that trained the model
     """
 
     object: str
@@ -229,7 +229,7 @@ def merge(parts: Iterable[SavedModel], *, force: bool = False) -> SavedModel:
     The size is the geometric mean of the sizes. An object without a name may be merged with one that has a name.
 
     The objects must look alike: each model is compared with the others by the similarity of its mean appearance (see
-    `catstream.detection.similarity`), of the two directions the higher one. Models of one object have 0.34 or more,
+    `catstream.detection.similarity`), which counts in its better direction. Models of one object have 0.34 or more,
     most pairs of different objects less than 0.25. Below 0.5 there is a UserWarning. Several models may be a chain, for
     example of views from different sides: each needs to look like one of the others only.
 

@@ -160,7 +160,7 @@ class Subscription(Generic[Message]):
 
     @property
     def run(self) -> str:
-        """Id of the run that the last message is from: of one start of one pipeline; empty if unknown."""
+        """Id of the run that sent the last message; each start of a pipeline is a run. Empty if unknown."""
         return self._connection.messages.run if self._connection is not None else ""
 
     def close(self) -> None:

@@ -35,12 +35,6 @@ class Compressor:
 
     Constant time a frame on average, logarithmic memory. The same features make the same samples, bit for bit, also
     across `state` and `from_state`.
-
-    began        number of the object's first frame in this stream
-    frame        number of the newest frame
-    box          last box in which the object was detected
-    detector     the detector state after the newest frame: a restarted detector continues from it
-    last_sample  the newest sample, None before the first
     """
 
     def __init__(self, settings: Settings, name: str = "") -> None:
@@ -51,12 +45,12 @@ class Compressor:
             )
         self.settings, self.name = settings, name
         self.trees = {name: CoresetTree(settings.coreset.size) for name in TREES}
-        self.began, self.frame = 0, -1
-        self.box: Box | None = None
-        self.detector: DetectorState | None = None
+        self.began, self.frame = 0, -1  #: numbers of the object's first frame in this stream, and of the newest frame
+        self.box: Box | None = None  #: of the last detection
+        self.detector: DetectorState | None = None  #: after the newest frame, for a restarted detector
         self.last_sample: Sample | None = None
-        self.centres = np.empty((0, 2))
-        self._path: list[tuple[float, float]] = []
+        self.centres = np.empty((0, 2))  #: the newest complete block
+        self._path: list[tuple[float, float]] = []  # the next block
         self._sampled_leaves = 0  # 0 before the first sample
         self._origin = ""  # digest of the first training rows in this stream, empty before them
         self._earlier: tuple[str, ...] = ()  # origins of the streams that the trees continue

@@ -27,19 +27,14 @@ class Forest:
 
     An object begins with its first features, with new trees or the trees of an earlier stream. If a message lacks an
     object, its trees are dropped. The same messages make the same samples, bit for bit, also across `save` and `load`.
-
-    seq          number of the newest message
-    frame        number of its frame
-    time         of that frame, in seconds
-    version      of the newest sample; all objects share one count, so that no version is used twice
-    compressors  by the names of their objects
     """
 
     def __init__(self, settings: Settings) -> None:
         self.settings = settings
-        self.seq = self.version = 0
-        self.frame, self.time = -1, 0.0
-        self.compressors: dict[str, Compressor] = {}
+        self.seq = 0  #: number of the newest message
+        self.frame, self.time = -1, 0.0  #: of the newest message, in seconds
+        self.version = 0  #: of the newest sample; all objects share one count, so that no version is used twice
+        self.compressors: dict[str, Compressor] = {}  #: by object
         self._states: deque[tuple[int, dict[str, DetectorState]]] = deque(maxlen=_MAX_STATES)  # of the last messages
 
     def check_features(self, features: Features) -> None:

@@ -42,19 +42,15 @@ class Detector:
 
     Call `init` with the first frame, or `seek` before it. For every other frame call `search`, then `update`; `adopt`
     models as they arrive.
-
-    state           after the last frame; None before there is an object. Together with the model (and SCM, if in use)
-                    it is all that the next frame depends on
-    model           with which the next frame is searched
-    newest_version  of the received models, even if it is not in use
-    similarity      to the object of a saved model, until its first detection; None without a saved model
     """
 
     def __init__(self, settings: Settings, name: str = "") -> None:
         self.settings, self.name = settings, name
+        #: State after the last frame. It, the model and SCM determine the next result.
         self.state: DetectorState | None = None
-        self.model = Model(0, -1, np.empty(0, np.float32), 0.0)
-        self.newest_version = 0
+        self.model = Model(0, -1, np.empty(0, np.float32), 0.0)  #: for the next frame
+        self.newest_version = 0  #: of the received models, even if it is not in use
+        #: Similarity to the object of a saved model, for its first detection.
         self.similarity: Similarity | None = None
         self._scm: SparseCollaborativeModel | None = None
         self._last_training: tuple[int, Cells] | None = None  # seq of the last training frame, and the cells around
@@ -69,7 +65,7 @@ class Detector:
     ) -> Result:
         """Start with the box of an object in pixels of the frame; a previous object is forgotten.
 
-        `together`, as in the state: the objects whose boxes overlap this one.
+        `together` becomes part of the state: the objects whose boxes overlap this one.
 
         BoxError if tracking cannot start with the box in this frame (see `Box.validated`), or if the object is
         indistinguishable from its background. The detector is then unchanged.

@@ -29,19 +29,17 @@ _MAX_COUNTED_BYTES = 1 << 30
 
 
 class VideoFile:
-    """A video file, which is read once.
-
-    damaged    number of skipped packets
-    scaled     number of frames that had another size than the first one
-    truncated  seconds of the stated duration after the last frame
-    """
+    """A video file, which is read once."""
 
     images: Sequence[Path] = ()
 
     def __init__(self, path: Path, settings: RunSettings, thread_type: str = "NONE") -> None:
         import av  # imported here because it takes 0.1 s and folders do not need it
 
-        self.path, self.settings, self.damaged, self.scaled, self.truncated = path, settings, 0, 0, 0
+        self.path, self.settings = path, settings
+        self.damaged = 0  #: number of skipped packets
+        self.scaled = 0  #: number of frames that had another size than the first one
+        self.truncated = 0  #: seconds of the stated duration after the last frame
         try:
             self.container = open_video(str(path.absolute()), settings.hwaccel)
         except (av.FFmpegError, OSError) as error:
