@@ -100,7 +100,7 @@ class Pipeline:
     first_frame : int or None
         With `resume`: number of the next frame that the caller needs, `after` + 1. It may be set before the start.
     first_time : float
-        Seconds at which the caller's last frame was; the times of a live source go on after it.
+        Time of the caller's last frame, in seconds; the times of a live source continue after it.
     saved_models : list of Path
         At the end: the files of `save_model` that were written.
 
@@ -198,8 +198,8 @@ class Pipeline:
     def _started(self, endpoint: str) -> tuple[Job, int]:
         """The job for the processes that are started now, and the number of the last frame before.
 
-        The caller or the checkpoint has that frame. The times of a live run go on after those before. A pause between
-        two parts of it does not count: nothing measures it if the clock of the machine was set meanwhile.
+        The caller or the checkpoint has that frame. The times of a live run continue. A pause between two parts of it
+        does not count: nothing measures it if the clock of the machine was set meanwhile.
         """
         first, passed = 0, 0.0
         if self._earlier is not None and self.state is not None:
@@ -253,7 +253,7 @@ class Pipeline:
         Parameters
         ----------
         seconds : float
-            Time without a frame after which an empty mapping is returned, for a program that has other work too.
+            Time without a frame after which an empty mapping is returned, for a program with other work.
 
         Raises
         ------
@@ -273,7 +273,7 @@ class Pipeline:
             self._rest.extend(tracks.values())
 
     def _next_frame(self, seconds: float = math.inf) -> dict[str, Track] | None:
-        """The track of each object in the next frame; none if the time is over, None at the end."""
+        """The track of each object in the next frame; empty if the time is over, None at the end."""
         tracks = self._running.next_frame(seconds)
         self._rows += len(tracks or ())
         return tracks

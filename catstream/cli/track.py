@@ -181,7 +181,7 @@ def track(
 class Outcome:
     """The end of a run.
 
-    folder      folder of its state; None for none
+    folder      folder of its state; None without one
     is_resumed  whether the run of the folder has continued
     frames      number of tracked frames
     missing     results that another program removed, or that were never written
@@ -230,7 +230,7 @@ class _Run:
     is_resumed  whether the run of a state folder continues
     stdout      whether tracks are also written to standard output
     overwrite   whether existing files are replaced
-    view        address of the web page; None for none
+    view        address of the web page; None without one
     """
 
     pipeline: Pipeline
@@ -262,7 +262,7 @@ class _Run:
             check_result(file, overwrite=self.overwrite, source=pipeline.source, made=results.output)
 
     def execute(self, console: Console) -> Outcome:
-        """Run to the end, and print a summary, also of a run that an error ends."""
+        """Run to the end, and print a summary, also after an error."""
         pipeline, files, models = self.pipeline, self.files, [*self.pipeline.results.models.values()]
         if self.is_resumed:
             if all(file.exists() for file in models) and files.is_complete(pipeline.frames):
@@ -272,8 +272,8 @@ class _Run:
         page = None if self.view is None else self._page(self.view)  # a port in use is an error before the run
         progress, interrupted = RunProgress(pipeline), False
         try:
-            # The files are closed after the processes, which would track on meanwhile, for none of them; the page is
-            # served until it shows the end.
+            # The processes end before the files are closed: otherwise, they would track frames that no file gets. The
+            # page is served until it shows the end.
             with ExitStack() as closed_last, pipeline:
                 if page is not None:
                     self._serve(*page, closed_last, console)
@@ -317,7 +317,7 @@ class _Run:
             for tracks in pipeline.by_frame(REFRESH_SECONDS):
                 if not has_said and "detector" in pipeline.health:  # it answers commands from now on
                     has_said = True
-                    self._say_what_holds(console)
+                    self._print_hint(console)
                 if not tracks:
                     progress.idle()
                     progress.show(status, console)
@@ -335,8 +335,8 @@ class _Run:
                     progress.not_written = outputs.not_written
                     progress.show(status, console)
 
-    def _say_what_holds(self, console: Console) -> None:
-        """Say how a run goes on that is paused or has no object."""
+    def _print_hint(self, console: Console) -> None:
+        """Print how to continue a run that is paused or has no object."""
         endpoint = f"--endpoint {quote(self.pipeline.endpoint)}"
         if self.pipeline.holding == "waiting":
             page = "the page" if self.view is not None else f"the page of catstream view {endpoint}"

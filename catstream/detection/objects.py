@@ -36,7 +36,7 @@ class Detectors:
     """
 
     def __init__(self, settings: Settings) -> None:
-        if settings.training.bootstrap == "scm":  # two seconds, for sklearn: before there is a frame
+        if settings.training.bootstrap == "scm":  # sklearn takes two seconds: before the first frame
             import catstream.detection.scm  # noqa: F401
         self.settings = settings
         self.seq = 0
@@ -96,7 +96,7 @@ class Detectors:
         self.detectors[name] = detector  # the last one, as in `begin`
 
     def begin_all(self, boxes: Mapping[str, Box], frame: Pyramid, time: float = 0.0) -> dict[str, Result]:
-        """Start several objects with their boxes in the next frame, by name; if one box is an error, none of them."""
+        """Start several objects with their boxes in the next frame, by name; no object starts if one box is invalid."""
         trial = copy(self)
         trial.detectors = dict(self.detectors)
         for name in boxes.keys() & trial.detectors.keys():
@@ -113,7 +113,7 @@ class Detectors:
     def step(
         self, frame: Pyramid, time: float = 0.0, results: Mapping[str, Result] | None = None
     ) -> tuple[Tracks, Features]:
-        """Track the objects in the next frame; `results` has those of `begin` and `correct`, which are not searched."""
+        """Track the objects in the next frame; those with `results` of `begin` or `correct` are not searched."""
         self.seq += 1
         results = dict(results or {})
         detectors = {name: detector for name, detector in self.detectors.items() if name not in results}
@@ -137,7 +137,7 @@ class Detectors:
         del self.detectors[name]
 
     def adopt(self, model: Model) -> None:
-        """Use a model for its object from now on, see `Detector.adopt`; that of a forgotten object is dropped."""
+        """Use a model for its object from now on (see `Detector.adopt`), unless the object was forgotten."""
         if (detector := self.detectors.get(model.object)) is not None:
             detector.adopt(model)
 
@@ -189,7 +189,7 @@ class Claim:
                     break
                 window = around.window(row, column)
                 if not any(_conflict(window.box(), other, self.is_uncertain) for other in occupied):
-                    # Elsewhere in the frame, it is redetected there too: its object is not trusted.
+                    # A redetected object is redetected there as well, so it is not trusted.
                     return replace(self.detection, score=score, window=window)
         return replace(self.detection, score=0.0, redetected=False)
 
@@ -229,7 +229,7 @@ def assign(detections: Mapping[str, Detection], states: Mapping[str, DetectorSta
 
 
 def _without_separated(state: DetectorState, states: Mapping[str, DetectorState]) -> DetectorState:
-    """The state of an object without the objects that it was together with, and that are confidently apart by now."""
+    """Return a state that is no longer `together` with objects from which it is confidently separated."""
     if not state.together:
         return state
     box = state.window.box()

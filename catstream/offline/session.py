@@ -124,8 +124,8 @@ class Session:
             return object, frame
 
     def image(self, number: int) -> UInt8:
-        """Return the image of a frame, before the passes go on. VideoError if it cannot be decoded: then, the damage
-        is searched for."""
+        """Return the image of a frame; passes are paused meanwhile. VideoError if it cannot be decoded: then, all
+        frames are read again to find the damage."""
         try:
             with self.annotation.paused():
                 return self.annotation.frames[number]

@@ -18,7 +18,7 @@ from catstream.base.files import write_atomically
 from catstream.errors import ProtocolError
 from catstream.wire.messages import DetectorState, Position
 
-_MOST_SAMPLES = 65536  # changes of the newest samples that are remembered until they are due
+_MOST_SAMPLES = 65536  # changes of the newest samples that are stored until `samples` returns them
 _SYNC_SECONDS = 60.0  # shortest time between two checkpoints that are forced to disk
 _SYNC_RATE = 0.3e6  # bytes per second that they write at most, on average
 _REST = 9.0  # from one checkpoint to the next, times the duration of the last one
@@ -46,7 +46,7 @@ class DesiredObject:
 class DesiredState:
     """The state of a run that holds until a command changes it.
 
-    objects  the objects by name, in the order in which they began; none before a box is set
+    objects  the objects by name, in the order in which they began; empty before a box is set
     paused   whether tracking is paused
     stopped  whether the stream is to end
     """
@@ -56,7 +56,7 @@ class DesiredState:
     stopped: bool = False
 
     def with_object(self, name: str, desired: DesiredObject) -> DesiredState:
-        """The state with one more object, in the place of another one of its name."""
+        """The state with one more object, which replaces another one of its name."""
         return replace(self, objects=self.without(name).objects | {name: desired})
 
     def without(self, name: str) -> DesiredState:
@@ -97,14 +97,14 @@ class Start:
 
 
 def resume_at(position: Position, after: int | None, desired: DesiredState, *, live: bool) -> Start:
-    """Return where a detector continues: after the last frame that both the compressor and the owner have.
+    """Return where a detector continues: after the last frame that the compressor and the program have.
 
     An object without a model begins again; only the SCM bootstrap, which is not stored, takes longer than a frame.
 
     Parameters
     ----------
     position : answer of the compressor, with the states after message `after`
-    after : number of the last message that the owner of the run has, None without an owner
+    after : number of the last message that the program has; None if the processes were started by hand
     """
     # Step 1: the last message of both. Frames of a live source cannot be read again: it continues after the last one
     # that was learned from.
@@ -144,7 +144,7 @@ class TrainingLag:
         self.processed = processed  #: seq of the newest features that the compressor has processed
         self._changes: deque[tuple[int, dict[str, int]]] = deque(maxlen=_MOST_SAMPLES)  # seq that led to these versions
         self._newest: dict[str, int] = {}  # the versions of the last reply
-        self._due: dict[str, int] = {}  # those that `samples` returned last
+        self._returned: dict[str, int] = {}  # by `samples`
 
     def reply(self, processed: int, versions: dict[str, int]) -> None:
         """Note a reply of the compressor: the seq that it has processed, and the versions of its newest samples.
@@ -159,25 +159,25 @@ class TrainingLag:
     def samples(self, seq: int) -> dict[str, int]:
         """The newest version of each object's samples that the features up to `seq` led to; `seq` never falls."""
         while self._changes and self._changes[0][0] <= seq:
-            self._due = self._changes.popleft()[1]
-        return self._due
+            self._returned = self._changes.popleft()[1]
+        return self._returned
 
-    def awaited(self, due: int, newest: Mapping[str, int]) -> Literal["", "features", "models"]:
+    def awaited(self, required: int, newest: Mapping[str, int]) -> Literal["", "features", "models"]:
         """The channel on which a detector waits before its next frame; "" to continue at once.
 
-        due     seq of the newest features that the models must include
-        newest  version of the newest model of each object that had begun before `due`
+        required  seq of the newest features that the models must include
+        newest    version of the newest model of each object that had begun before `required`
 
         >>> lag = TrainingLag(processed=6)
-        >>> lag.awaited(due=7, newest={"": 2})
+        >>> lag.awaited(required=7, newest={"": 2})
         'features'
         >>> lag.reply(8, {"": 3})
-        >>> lag.awaited(due=7, newest={"": 2}), lag.awaited(due=7, newest={"": 3})
+        >>> lag.awaited(required=7, newest={"": 2}), lag.awaited(required=7, newest={"": 3})
         ('models', '')
         """
-        if self.processed < due:
+        if self.processed < required:
             return "features"
-        samples = self.samples(due).items()
+        samples = self.samples(required).items()
         return "models" if any(newest[name] < version for name, version in samples if name in newest) else ""
 
 

@@ -1,6 +1,6 @@
-"""The processes of a run, in the program that owns it: started, received from, restarted if one dies or hangs, ended.
+"""Starts the processes of a run, receives their messages, restarts processes that die or hang, and ends all of them.
 
-All of this is done by one thread, however long the program takes with each frame.
+One thread of the program does this, however long the program takes with each frame.
 """
 
 from __future__ import annotations
@@ -102,7 +102,7 @@ class Child:
         return self.process.poll() if self.process is not None else None
 
     def start(self, after: int) -> None:
-        """Start the process; the owner of the run has the frames up to message `after`."""
+        """Start the process; the program has the frames up to message `after`."""
         self.end()
         self.memory.owner.after = self.memory.owner.read = after
         self.memory.watchdog.allow()
@@ -212,7 +212,7 @@ class Supervisor:
         return sum(len(child.restarts) for child in self._children.values())
 
     def next_frame(self, seconds: float = math.inf) -> dict[str, Track] | None:
-        """Wait for the next frame: the track of each object by name; none if the time is over, None after the last one.
+        """Wait for the next frame: the tracks by object name; empty if the time is over, None after the last frame.
 
         ServiceError if a process fails repeatedly, or another thread has ended the run; VideoError after the last frame
         if the source failed.
@@ -262,7 +262,7 @@ class Supervisor:
         with self._changed:
             self._changed.wait_for(lambda: self._phase >= phase)
 
-    # In the thread
+    # Methods of the thread
 
     def _run(self, resources: ExitStack) -> None:
         """Receive until the detector has exited after the end of the run; then wait for `stop`."""
@@ -271,7 +271,7 @@ class Supervisor:
                 deadline = math.inf
                 try:
                     while self._phase < Phase.STOPPING and self._clock() < deadline:
-                        self._turn()
+                        self._iterate()
                         if self.end is not None:
                             deadline = min(deadline, self._clock() + SHUTDOWN_SECONDS)
                             if self._children["detector"].code in ENDED:
@@ -285,8 +285,8 @@ class Supervisor:
         finally:
             self._enter(Phase.ENDED)
 
-    def _turn(self) -> None:
-        """Receive the next frame or the end; from time to time the health, and look after the processes."""
+    def _iterate(self) -> None:
+        """Receive the next frame or the end; at intervals, receive the health and check the processes."""
         message = self._results.receive(TURN_SECONDS)
         if isinstance(message, End):
             self.end = message
@@ -308,7 +308,7 @@ class Supervisor:
         for report in self._reports.receive_all():
             before = self.health.get(report.process)
             is_new = before is None or before.trouble != report.trouble
-            is_logged = report.process == "detector" and report.counters.get("write_failed")  # by the owner
+            is_logged = report.process == "detector" and report.counters.get("write_failed")  # by the program
             if report.trouble and is_new and not is_logged:
                 _log.warning("%s: %s", report.process, report.trouble)
             self.health = self.health | {report.process: report}
@@ -364,5 +364,5 @@ class Supervisor:
             child.process.send_signal(signal.SIGTERM)
             limit = max(deadline, self._clock() + LEAST_SECONDS)
             while child.code is None and self._phase < Phase.HURRYING and self._clock() < limit:
-                self._turn()
+                self._iterate()
         self._receive_health()

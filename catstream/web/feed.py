@@ -68,17 +68,17 @@ class PipelineFeed:
         self._thread.start()
 
     def end(self) -> None:
-        """Let the thread end as soon as it does not wait for an answer."""
+        """Ask the thread to end; it may still wait for an answer."""
         self._stopped.set()
 
     def stop(self) -> None:
-        """End the thread, and wait for it, but not for long."""
+        """End the thread, and wait for it for at most `STOP_SECONDS`."""
         self.end()
         self._thread.join(STOP_SECONDS)
 
     @property
     def problem(self) -> str:
-        """Why no frames are tracked; empty if they are. It names no address: anybody may ask for it."""
+        """Why no frames are tracked; empty if they are. It contains no address, because anyone may request it."""
         since, last = monotonic() - SILENCE_SECONDS, self.dashboard.last_reports
         silent = [name for name in CHANNELS["health"].senders if name not in last or last[name] < since]
         state, words = self.dashboard.state
@@ -87,7 +87,7 @@ class PipelineFeed:
         return "" if state == "running" else words
 
     def wait_for_end(self) -> None:
-        """Wait until the end of the pipeline has arrived, but not for long; called before the server is stopped."""
+        """Wait at most `DRAIN_SECONDS` for the end of the pipeline; called before the server is stopped."""
         self._has_end.wait(DRAIN_SECONDS)
 
     def execute(self, **command: Any) -> Answer:
