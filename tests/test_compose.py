@@ -19,7 +19,7 @@ VARIABLE = r"\$\{(\w+):-([^}]*)\}"  # with its default
 SERVICES = yaml.safe_load(re.sub(VARIABLE, r"\2", TEXT).replace("$$", "$"))["services"]
 
 
-def test_services_have_no_privileges_and_publish_only_the_page_on_loopback():
+def test_services_have_no_privileges_and_one_local_port():
     assert SERVICES.keys() == {*NAMES, "view", "tracks"}
     assert [port for service in SERVICES.values() for port in service.get("ports", [])] == ["127.0.0.1:8000:8000"]
     for service in SERVICES.values():

@@ -1,4 +1,4 @@
-"""Linear algebra on one thread, whatever the program has set or imported: the same bits."""
+"""Linear algebra on one thread gives the same bits for any settings and imports of the program."""
 
 import os
 import subprocess
@@ -42,8 +42,8 @@ with one_thread():
 def test_library_that_is_imported_inside_has_one_thread():
     environment = os.environ | dict.fromkeys(ONE_THREAD, "2")
     program = [sys.executable, "-c", FIRST_USE]
-    said = subprocess.run(program, env=environment, capture_output=True, text=True, check=True)
-    assert said.stdout == "{1}\n"
+    done = subprocess.run(program, env=environment, capture_output=True, text=True, check=True)
+    assert done.stdout == "{1}\n"
 
 
 @pytest.mark.usefixtures("two_threads")

@@ -50,7 +50,7 @@ def test_workers_are_started_again_after_a_caller_stopped_early():
         assert [*workers.run(os.getpid, [()])] != [first]
 
 
-def test_workers_outlive_the_thread_that_started_them_until_closed():
+def test_workers_outlive_the_thread_that_started_them():
     with closing(Workers(1)) as workers:
         with ThreadPoolExecutor(1) as thread:
             first = thread.submit(lambda: [*workers.run(os.getpid, [()])]).result()

@@ -26,7 +26,7 @@ def stream(seed, frames=FRAMES, appearance=1.0):
 
 
 def compressed(messages, compressor=None, settings=SETTINGS, name=""):
-    """A compressor that has taken the features."""
+    """A compressor after these features."""
     compressor = compressor or Compressor(settings, name)
     for message in messages:
         compressor.take(compressor.frame + 1, message, compressor.version + 1)

@@ -220,7 +220,7 @@ def test_behind_is_the_age_of_the_last_track(endpoint, tracks, attached, until):
         assert subscription.behind == 0
 
 
-def test_newest_subscription_yields_the_last_track_of_each_object(tracks, attached):
+def test_newest_subscription_ends_with_the_last_tracks(tracks, attached):
     with attached(newest=True) as subscription:
         for seq in range(2, 50):
             for name in ("anna", "ben"):

@@ -95,8 +95,8 @@ with catstream.Pipeline(sys.argv[1], sys.argv[2]) as pipeline, catstream.subscri
             use = tracks = pipeline = None
             gc.collect()
             os._exit(7)
-    kept = {'job.safetensors', 'owner', 'endpoint', 'results'} <= {*os.listdir(pipeline.endpoint)}
-    print(*codes, kept, 1 + len([*tracks]), pipeline.totals["restarts"])
+    complete = {'job.safetensors', 'owner', 'endpoint', 'results'} <= {*os.listdir(pipeline.endpoint)}
+    print(*codes, complete, 1 + len([*tracks]), pipeline.totals["restarts"])
 """
 
 
@@ -124,6 +124,6 @@ def test_second_pipeline_at_the_same_endpoint_is_rejected(video, transport, fold
 
 
 def test_frames_in_memory_are_an_error_that_names_the_tracker():
-    said = r"the number of a camera, got \w+: pass frames in memory to catstream.Tracker"
-    with pytest.raises(VideoError, match=said):
+    message = r"the number of a camera, got \w+: pass frames in memory to catstream.Tracker"
+    with pytest.raises(VideoError, match=message):
         Pipeline(np.zeros((9, 9, 3), np.uint8), (0, 0, 10, 10))

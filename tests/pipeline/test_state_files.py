@@ -103,4 +103,4 @@ def test_resumed_live_run_continues_its_frames_and_times(tmp_path):
         again = list(islice(pipeline, 5))
     assert [track.frame for track in again] == list(range(last.frame + 1, last.frame + 6))
     assert again[0].time > last.time
-    assert again[0].model_version > 0, "the models were kept"
+    assert again[0].model_version > 0, "the models were restored"

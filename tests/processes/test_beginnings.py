@@ -92,7 +92,7 @@ def test_pause_with_a_limit_ends_by_itself(stream, monkeypatch):
     assert not stream.commands.hold
 
 
-def test_run_resumes_with_its_original_boxes_if_its_state_is_torn(folder, tmp_path, monkeypatch):
+def test_run_with_a_torn_state_resumes_with_its_first_boxes(folder, tmp_path, monkeypatch):
     monkeypatch.setattr("signal.signal", lambda *_: None)  # the handlers of this process stay
     (tmp_path / DESIRED).write_text("{")
     job = Job("walk.mp4", {"anna": BOX}, endpoint=str(folder), run="one", state=tmp_path, resume=True)

@@ -1,4 +1,4 @@
-"""Whether a process goes on: the first reason counts, but a source that fails is an error whatever came before."""
+"""The reason of the end of a process: the first one, unless the source fails."""
 
 import os
 import signal

@@ -76,12 +76,12 @@ def test_field_of_another_type_is_an_error(tmp_path, field, value):
 
 def test_forked_copy_of_a_process_does_not_keep_its_lock(tmp_path):
     lives, ends = os.pipe()
-    with locked(tmp_path / "kept"):
+    with locked(tmp_path / "state"):
         if not os.fork():
             os.close(ends)
             os.read(lives, 1)
             os._exit(0)
-    with locked(tmp_path / "kept"):
+    with locked(tmp_path / "state"):
         os.close(ends)
     os.wait()
     os.close(lives)

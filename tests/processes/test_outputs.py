@@ -37,7 +37,7 @@ def test_detector_waits_for_its_program(process):
         assert [owner.receive(60).seq for _ in range(7)] == list(range(1, 8))
 
 
-def test_signalled_detector_does_not_wait_and_sends_nothing_after_a_drop(process):
+def test_signalled_detector_does_not_wait(process):
     process.ending._handle()
     with Outputs(process, lambda: pytest.fail("it waits"), lambda *_: None) as outputs:
         for seq in range(1, 9):

@@ -5,7 +5,7 @@ from contextlib import closing
 from catstream.processes.shared import LONG_SECONDS, RUNNING_SECONDS, SharedMemory
 
 
-def test_watchdog_counts_iterations_and_allows_announced_long_steps():
+def test_watchdog_allows_announced_long_steps():
     with closing(SharedMemory()) as memory:
         watchdog = memory.watchdog
         assert watchdog.patience == LONG_SECONDS, "a start takes long"

@@ -19,7 +19,7 @@ from catstream.features.pyramid import Pyramid
 from catstream.video import rendered
 from catstream.wire.channels import CHANNELS
 from catstream.wire.codec import KINDS, VERSION, decode, encode
-from catstream.wire.messages import LARGEST_GIVEN_MODELS, Features, Health, ObjectFeatures, Track, TrainingRows
+from catstream.wire.messages import LARGEST_GIVEN_MODELS, Features, Health, ObjectFeatures, Sample, Track, TrainingRows
 from catstream.wire.schema import LONGEST_LIST, LONGEST_TEXT
 from tests.wire.examples import example
 
@@ -94,6 +94,11 @@ def test_features_of_the_most_objects_fit_into_their_channel():
     _, features = detectors.step(pyramid, results={"": detectors.begin("", pyramid, box)})
     largest = get_args(describe()["run.max_objects"].type)[1].le * len(encode(features)) + LARGEST_GIVEN_MODELS
     assert largest < CHANNELS["all-features"].limit == CHANNELS["features"].limit
+
+
+def test_nan_arrives_in_an_array_that_allows_it():
+    sample = dataclasses.replace(EXAMPLES["sample"], centres=np.full((1, 2), np.nan))
+    assert np.isnan(decode(encode(sample), Sample).centres).all()
 
 
 def test_field_of_a_later_version_is_ignored():

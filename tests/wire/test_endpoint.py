@@ -74,7 +74,7 @@ def test_invalid_endpoint_is_an_error(text, word):
 @pytest.mark.parametrize("disk", [65_536], indirect=True)
 def test_full_disk_for_temporary_files_is_an_error_that_names_it(disk, monkeypatch):
     monkeypatch.setattr(tempfile, "tempdir", str(disk))
-    monkeypatch.delenv("XDG_RUNTIME_DIR", raising=False)  # which is taken if the names of the disk's are too long
+    monkeypatch.delenv("XDG_RUNTIME_DIR", raising=False)  # otherwise used if the paths on the disk are too long
     (disk / "ballast").write_bytes(bytes(65_536))
     with (
         pytest.raises(ServiceError, match=f"{disk}.*No space left"),
@@ -90,6 +90,7 @@ def test_no_folder_for_temporary_files_is_an_error(monkeypatch):
     monkeypatch.delenv("XDG_RUNTIME_DIR", raising=False)
     with pytest.raises(ServiceError, match="TMPDIR"), private_folder():
         pass
+    assert running() == []
 
 
 def test_folder_of_sockets_is_private_to_this_user(folder):
@@ -108,19 +109,21 @@ def test_folder_of_sockets_is_private_to_this_user(folder):
             pass
 
 
-def killed(place: str = "") -> Path:
-    """Kill a pipeline that meets in a folder, or in a private one; returns the folder."""
-    script = "import os, signal, sys; from catstream.wire.discovery import reserve_endpoint, private_folder\n"
-    script += "with private_folder() as private, reserve_endpoint(sys.argv[1], private) as endpoint:\n"
-    script += "    print(endpoint, flush=True)\n    os.kill(os.getpid(), signal.SIGKILL)"
-    return Path(subprocess.run([sys.executable, "-c", script, place], capture_output=True, text=True).stdout.strip())
+#: Is killed while it has a private folder; prints the folder.
+KILLED = """
+import os, signal
+from catstream.wire.discovery import private_folder, reserve_endpoint
+with private_folder() as folder, reserve_endpoint("", folder) as endpoint:
+    print(endpoint, flush=True)
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
 
 
 def test_private_folder_of_a_killed_process_is_removed(folder, monkeypatch):
     monkeypatch.setattr(tempfile, "tempdir", str(folder))
     monkeypatch.setenv("TMPDIR", str(folder))
     monkeypatch.delenv("XDG_RUNTIME_DIR", raising=False)
-    left = killed()
+    left = Path(subprocess.run([sys.executable, "-c", KILLED], capture_output=True, text=True).stdout.strip())
     assert (left / "endpoint").read_text() == f"{left}\n\n"
     assert running() == []
     with private_folder() as first, private_folder() as second:

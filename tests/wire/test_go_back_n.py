@@ -1,4 +1,4 @@
-"""The acknowledged window, in random histories: each message is processed once, in order, whatever breaks or restarts.
+"""The acknowledged window in random histories: each message is processed once and in order, also after restarts.
 
 No process, no socket, no clock: the two state machines, a network that breaks and repeats frames, and a disk.
 """

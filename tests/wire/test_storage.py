@@ -56,9 +56,11 @@ def test_damaged_or_incomplete_file_is_refused(damage):
     content = bytearray(WHOLE)
     for place, byte in damage:
         content[int(place * len(content))] = byte
-    said = r"trees is not an undamaged file of catstream \((.|\n)*\): use an older copy, or a file that catstream wrote"
-    assert re.fullmatch(f"({said})?", refusal(bytes(content)))
-    assert re.fullmatch(said, refusal(WHOLE[: int(damage[0][0] * len(WHOLE))]))
+    message = (
+        r"trees is not an undamaged file of catstream \((.|\n)*\): use an older copy, or a file that catstream wrote"
+    )
+    assert re.fullmatch(f"({message})?", refusal(bytes(content)))
+    assert re.fullmatch(message, refusal(WHOLE[: int(damage[0][0] * len(WHOLE))]))
 
 
 @pytest.mark.parametrize("name", ARRAYS)

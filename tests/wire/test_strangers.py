@@ -87,7 +87,7 @@ def test_replies_to_a_stranger_do_not_redirect_acknowledgements(endpoint, strang
 
 
 @pytest.mark.parametrize("name", PUBLISHED)
-def test_message_to_a_publisher_is_counted_and_affects_no_subscriber(name, endpoint, stranger, until):
+def test_message_to_a_publisher_affects_no_subscriber(name, endpoint, stranger, until):
     message, before, received = example(CHANNELS[name].messages[0]), rejected(), []
     channel = CHANNELS[name]
     with Publisher(channel, endpoint, channel.senders[0]) as publisher, Subscriber(channel, endpoint) as reader:
@@ -119,7 +119,7 @@ def test_client_that_leaves_during_its_handshake_is_not_counted(sent, endpoint, 
         assert rejected() == before
 
 
-def test_message_above_the_size_limit_closes_its_connection_unread(endpoint, stranger, until):
+def test_message_above_the_limit_closes_its_connection(endpoint, stranger, until):
     before = rejected()
     with Receiver(RESULTS, endpoint, Position(), WINDOW) as receiver, Sender(RESULTS, endpoint, WINDOW) as sender:
         other = stranger(zmq.DEALER, "results")
