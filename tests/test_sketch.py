@@ -1,4 +1,4 @@
-"""Laws of CoresetPCA: those of an estimator of scikit-learn, and its error beside a PCA of all rows."""
+"""Laws of CoresetPCA: the interface of scikit-learn, and its error compared with a PCA of all rows."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Checkpoints on disk: the last two, each whole or not at all, and what is done about one that is damaged."""
+"""Checkpoints on disk: the last two, each complete; damage is detected and reported."""
 
 import errno
 import os

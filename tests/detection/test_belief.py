@@ -1,4 +1,4 @@
-"""Belief: its levels, what the detector does at each, and the Kalman filter of the centre, at rest while lost."""
+"""Belief: its levels, their actions, and the Kalman filter of the centre."""
 
 import dataclasses
 

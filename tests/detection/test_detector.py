@@ -177,7 +177,7 @@ def test_new_object_adopts_no_model_of_the_one_before(scene):
 
 @pytest.fixture
 def learned(scene):
-    """A model of the object, as one that is saved."""
+    """A saved model of the object."""
     return dataclasses.replace(started(scene).model, version=7)
 
 

@@ -128,7 +128,7 @@ def test_copies_depend_on_the_seed_and_begin_with_the_window(image, moved):
 @pytest.mark.parametrize(("moved", "changed"), [(0.0, 0), (0.25, 2), (0.5, 4), (1.0, 8)])
 def test_share_of_the_copies_has_another_background(rng, moved, changed):
     image = np.full((200, 240, 3), 60, np.uint8)
-    image[:, 128:] = 250  # beside the box
+    image[:, 128:] = 250  # right of the box
     image[60:100, 76:116] = rng.integers(0, 256, (40, 40, 3), np.uint8)
     plain = copies(image, BOX, 9)
     rows = copies(image, BOX, 9, moved=moved)

@@ -58,5 +58,5 @@ def sequence(walk: Path) -> Sequence:
 
 @pytest.fixture
 def found(sequence: Sequence) -> np.ndarray:
-    """Boxes a little beside the truth, float64 (12, 4)."""
+    """Boxes with small errors, float64 (12, 4)."""
     return np.nan_to_num(sequence.boxes, nan=30.0) + np.array([2, 1, 1, -1])

@@ -54,7 +54,7 @@ def test_results_of_different_plans_do_not_compare(before, after):
         compare(before, after, 0.1)
 
 
-def test_searches_compare_by_what_they_have_found(before, after):
+def test_searches_compare_by_their_highest_number(before, after):
     for each, streams in ((before, 5), (after, 4)):
         each |= {"find": "streams", "highest": streams}
         each["plan"]["streams"] = streams

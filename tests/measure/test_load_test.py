@@ -35,7 +35,7 @@ def test_interrupted_run_returns_its_measurements():
     assert 10 <= len(stream.due) < plan.frames
     assert len(stream.due) == len(stream.track)
     assert load_test.result.seconds == pytest.approx(len(stream.due) / 20)
-    assert stream.totals["sent"] == stream.totals["stored"] > len(stream.due)  # what it learned before counts too
+    assert stream.totals["sent"] == stream.totals["stored"] > len(stream.due)  # including the frames before the run
     assert children() == []
 
 
@@ -127,7 +127,7 @@ def test_malformed_limit_is_an_error(text):
 
 
 @pytest.mark.parametrize(
-    ("facts", "said"),
+    ("facts", "message"),
     [
         ({"rate": 0.5, "duration": 0.9}, "no frame is due"),
         ({"size": (321, 240), "source": "h264"}, "an even width"),
@@ -135,8 +135,8 @@ def test_malformed_limit_is_an_error(text):
         ({"slow_subscribers": 1}, "more slow subscribers"),
     ],
 )
-def test_contradictory_plan_is_an_error(facts, said):
-    with pytest.raises(SettingsError, match=said):
+def test_contradictory_plan_is_an_error(facts, message):
+    with pytest.raises(SettingsError, match=message):
         Plan(**facts)
 
 

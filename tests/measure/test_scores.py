@@ -1,4 +1,4 @@
-"""The measures: those of the benchmarks, number by number, and the laws they keep."""
+"""Measures of accuracy: equal to the benchmarks, and the laws of overlap."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""The subscribers of a load test: each fast one counts what it receives and misses, and records when it arrives."""
+"""The subscribers of a load test: each fast one records arrivals and counts gaps."""
 
 from time import monotonic
 

@@ -1,4 +1,4 @@
-"""Annotation of a rendered video: what is tracked, what is checked, and which frame is asked for."""
+"""Annotation of a rendered video: passes, checked frames, and the next frame to label."""
 
 import multiprocessing
 import shutil

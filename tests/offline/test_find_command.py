@@ -1,4 +1,4 @@
-"""`catstream find`: its files, its report, and what happens after Ctrl-C."""
+"""`catstream find`: its files, its report, and Ctrl-C."""
 
 import csv
 import json

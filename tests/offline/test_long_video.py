@@ -1,4 +1,4 @@
-"""A long video: the costs of annotation are those of the annotated stretch."""
+"""A long video: annotation costs in proportion to the annotated stretch."""
 
 import resource
 import tempfile

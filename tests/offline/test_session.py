@@ -1,4 +1,4 @@
-"""A session: what a person changes is saved at once, tracked in the background, and undone."""
+"""A session: changes are saved at once, tracked in the background, and undone."""
 
 import shutil
 from concurrent.futures import Future
