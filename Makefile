@@ -32,7 +32,7 @@ $(INSTALLED): requirements.lock pyproject.toml
 	@touch $@
 
 $(READY): $(INSTALLED)
-	@.ci/step "compiling kernels, once" $(BIN)/python -P -c 'import logging; logging.disable(); import catstream.detection.detector'
+	@.ci/step "compiling kernels, once" $(BIN)/python -P -c 'import logging; logging.disable(); import catstream.detection.detector, catstream.detection.scm'
 	@touch $@
 
 develop: $(READY) $(TOOLS)  ## add the packages for tests and checks, from requirements-dev.lock
