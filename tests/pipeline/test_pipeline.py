@@ -47,7 +47,7 @@ def test_lockstep_gives_the_tracks_of_one_process(video, in_one_process, folder,
             tracks.append(each)
             if victim := victims.get(len(tracks)):
                 os.kill(pipeline.pids[victim], signal.SIGTERM if victim == "trainer" else signal.SIGKILL)
-        assert pipeline.restarts == len(victims)
+        assert pipeline.restarts >= len(victims)
     if not victims:
         assert tracks == expected
     assert [[*each] for each in tracks] == [[*each] for each in expected]
