@@ -1,9 +1,8 @@
-"""`catstream track` of live streams, until Ctrl-C."""
+"""`catstream track` of a live stream, until Ctrl-C."""
 
 import csv
 import re
 import signal
-from contextlib import contextmanager
 
 import cv2
 import psutil
@@ -14,90 +13,42 @@ from catstream.client.attach import subscribe
 from catstream.video.rendered import render
 
 
-@pytest.fixture(scope="module")
-def story():
-    """The demo's first images and boxes, forwards and backwards: a loop without a jump."""
+def test_live_run_continues_after_faults_until_ctrl_c(camera, catstream, said, tmp_path):
     frames = list(render(60, (320, 240)))
-    return frames + frames[-2:0:-1]
-
-
-class Run:
-    """A run of `catstream track`, seen from outside."""
-
-    def __init__(self, process, output, health):
-        self.process, self.output, self._health = process, output, health
-
-    def until(self, condition):
-        """Wait until the detector's counters are so."""
-        for report in self._health:
-            if report.process == "detector" and condition(report.counters):
-                return report.counters
-        raise AssertionError(f"the run has ended: {self.process.poll()}")
-
-    def stopped(self):
-        """Its rows and what it said, after Ctrl-C."""
-        self.process.send_signal(signal.SIGINT)
-        errors = self.process.communicate(timeout=500)[1]
-        assert self.process.returncode == 130
-        rows = list(csv.DictReader((self.output / "one.csv").read_text().splitlines()))
-        assert len((self.output / "one.ndjson").read_text().splitlines()) == 1 + len(rows)
-        return rows, errors
-
-
-@pytest.fixture
-def following(catstream, story, tmp_path):
-    """Follows the object of the story in a stream."""
-
-    @contextmanager
-    def start(url, *more):
-        output, place = tmp_path / "out", tmp_path / "run"
-        with subscribe(str(place), "health", timeout=500) as health:
-            box = ",".join(map(str, story[0][1]))
-            command = ("track", url, "--box", box, "--output", output, "--set", f"run.endpoint={place}", *more)
-            yield Run(catstream(*command), output, health)
-
-    return start
-
-
-def found(row, story):
-    """Whether the box of a row is where the object is in some image of the story."""
-    box = row["x"] and Box(*(float(row[name]) for name in "xywh"))
-    return bool(box) and max(box.overlap(truth) for _, truth in story) > 0.6
-
-
-def test_restarted_detector_scales_frames_of_another_size(camera, following, story):
-    scale = [1]
-    cam = camera(lambda number: cv2.resize(story[number % len(story)][0], None, fx=scale[0], fy=1))
-    with following(cam.url) as run:
-        sent = run.until(lambda counters: counters["model_version"] >= 3)["sent"]
+    frames += frames[-2:0:-1]  # forwards and backwards: a loop without a jump
+    scale, output, endpoint = [1], tmp_path / "out", tmp_path / "run"
+    cam = camera(lambda number: cv2.resize(frames[number % len(frames)][0], None, fx=scale[0], fy=1))
+    box = ",".join(map(str, frames[0][1]))
+    with subscribe(str(endpoint), "health", timeout=500) as health:
+        run = catstream("track", cam.url, "--box", box, "--output", output, "--set", f"run.endpoint={endpoint}")
+        detector = (report.counters for report in health if report.process == "detector")
+        sent = next(counters["sent"] for counters in detector if counters["model_version"] >= 3)
+        # The detector is restarted, and the frames change their size.
         scale[0] = 2
-        (server,) = psutil.Process(run.process.pid).children()
-        detector, *_ = sorted(server.children(), key=psutil.Process.create_time)  # it is the first that is started
-        detector.kill()
-        run.until(lambda counters: counters["sent"] > sent + 80)
-        rows, errors = run.stopped()
-    assert "processes restarted: 1" in errors
+        (server,) = psutil.Process(run.pid).children()
+        min(server.children(), key=psutil.Process.create_time).kill()  # the detector is the first that is started
+        assert any(counters["sent"] > sent + 80 for counters in detector)
+        # The stream is lost.
+        cam.leave()
+        assert any(counters.get("lost_seconds", 0) > 0 for counters in detector)
+        code, status, _ = said("status", "--endpoint", endpoint, "--wait", 150)
+        assert code == 0, "all processes report"
+        assert re.search(r"^state +source lost for \d+ s$", status, re.MULTILINE)
+        assert re.search(r"^source +\d+ frames? skipped, 0 reconnects$", status, re.MULTILINE)
+        run.send_signal(signal.SIGINT)
+        errors = run.communicate(timeout=500)[1]
+        list(detector)
+        assert (health.end.reason, health.end.failed) == ("it was stopped", False)
+    assert run.returncode == 130
+    for message in ("processes restarted: 1", "lost source one", "the results so far are kept"):
+        assert message in errors
+    rows = list(csv.DictReader((output / "one.csv").read_text().splitlines()))
+    assert len((output / "one.ndjson").read_text().splitlines()) == 1 + len(rows)
     assert [int(row["frame"]) for row in rows] == list(range(len(rows)))
     seconds = [float(row["seconds"]) for row in rows]
     assert seconds == sorted(seconds)
-    assert sum(found(row, story) for row in rows) > 0.8 * len(rows)
-
-
-def test_ctrl_c_ends_a_run_with_a_lost_stream(camera, following, said, story, tmp_path):
-    cam = camera(lambda number: story[number % len(story)][0])
-    with following(cam.url) as run, subscribe(str(tmp_path / "run"), "tracks", timeout=500) as tracks:
-        next(tracks)
-        cam.leave()
-        run.until(lambda counters: counters.get("lost_seconds", 0) > 0)
-        code, status, _ = said("status", "--endpoint", tmp_path / "run", "--wait", 150)
-        assert code == 0, "the processes are well"
-        assert re.search(r"^state +source lost for \d+ s$", status, re.MULTILINE)
-        assert re.search(r"^source +\d+ frames? skipped, 0 reconnects$", status, re.MULTILINE)
-        rows, errors = run.stopped()
-        assert len(list(tracks)) < len(rows)
-        assert (tracks.end.reason, tracks.end.failed) == ("it was stopped", False)
-    assert "lost source one" in errors
-    assert "the results so far are kept" in errors
+    boxes = [Box(*(float(row[name]) for name in "xywh")) for row in rows if row["x"]]
+    assert sum(max(box.overlap(truth) for _, truth in frames) > 0.6 for box in boxes) > 0.8 * len(rows)
 
 
 REJECTED = {"omit lockstep": ["--lockstep"], "has no start, end or stride": ["--start=9"], "connection refused": []}
