@@ -28,8 +28,8 @@ from catstream.wire.keys import allow
 
 pytestmark = pytest.mark.system
 
-FRAMES = 32
 LIVE = "demo:1"
+GATE = StreamSpec("gate", LIVE, {"anna": first_box(LIVE)}, cores=0.3)
 NODE = {"num_cpus": 1, "object_store_memory": 80 << 20}
 SOUTH = NODE | {"node_name": "south", "labels": {"site": "south"}}
 
@@ -140,13 +140,6 @@ def test_second_up_changes_a_fleet_and_down_ends_it_from_elsewhere(local, catstr
 
 
 @pytest.fixture(scope="module")
-def streams(demo_video):
-    path, truth = demo_video(FRAMES)
-    film = StreamSpec("film", str(path), {"": truth[0]}, settings={"run.lockstep": True}, cores=0.3)
-    return {"film": film, "gate": StreamSpec("gate", LIVE, {"anna": first_box(LIVE)}, cores=0.3)}
-
-
-@pytest.fixture(scope="module")
 def cluster(home):
     """A cluster of the nodes north and south, as `ray start` would start them, but on the loopback interface."""
     home.mkdir(parents=True, exist_ok=True)
@@ -165,12 +158,12 @@ def cluster(home):
 
 
 @pytest.fixture(scope="module")
-def site(cluster, streams, tmp_path_factory):
-    """A fleet of two streams on two nodes, and its spec."""
+def site(cluster, tmp_path_factory):
+    """A fleet of a stream on two nodes, and its spec."""
     with socket.create_server(("127.0.0.1", 0)) as probe:
         registry = f"127.0.0.1:{probe.getsockname()[1]}"
     store = str(tmp_path_factory.mktemp("store") / "new")
-    spec = FleetSpec("site", store, every=0.5, registry=registry, streams=streams)
+    spec = FleetSpec("site", store, every=0.5, registry=registry, streams={"gate": GATE})
     with Fleet(spec, address=cluster.address) as site:
         site.up()
         yield site, spec
@@ -191,7 +184,7 @@ def status_of(site, until):
     return wait
 
 
-def test_subscriber_with_a_key_stays_attached_to_a_stream_that_moves(site, streams, status_of, until, home, tmp_path):
+def test_subscriber_with_a_key_stays_attached_to_a_stream_that_moves(site, status_of, until, home, tmp_path):
     fleet, spec = site
     before = status_of("gate")
     allow(home / "site" / "keys", "desk", "watch", output=tmp_path / "desk")
@@ -205,15 +198,15 @@ def test_subscriber_with_a_key_stays_attached_to_a_stream_that_moves(site, strea
                 return subscription, next(subscription)
 
         tracks, first = until(attached)
-        fleet.add(replace(streams["gate"], labels={"ray.io/node-id": node_id(other)}))
+        fleet.add(replace(GATE, labels={"ray.io/node-id": node_id(other)}))
         status_of("gate", node=other)
         endpoint = tracks.endpoint
         next(track for track in tracks if tracks.endpoint != endpoint)
     assert first.object == "anna"
     assert fleet.status().streams["gate"].token > before.token
-    fleet.add(replace(streams["gate"], labels={"site": "west"}))
+    fleet.add(replace(GATE, labels={"site": "west"}))
     until(lambda: "Ray has not started it" in fleet.status().streams["gate"].trouble)
-    fleet.add(streams["gate"])
+    fleet.add(GATE)
     status_of("gate")
 
 
@@ -222,13 +215,13 @@ def node_id(name):
     return next(node["NodeID"] for node in nodes() if node["NodeName"] == name)
 
 
-def test_stream_runs_on_a_node_with_its_labels_and_moves_if_it_dies(site, cluster, streams, status_of, until):
+def test_stream_runs_on_a_node_with_its_labels_and_moves_if_it_dies(site, cluster, status_of, until):
     fleet, spec = site
-    fleet.add(replace(streams["gate"], labels={"site": "south"}))
+    fleet.add(replace(GATE, labels={"site": "south"}))
     status_of("gate", node="south")
     fleet.add(StreamSpec("full", LIVE, cores=0.8, labels={"ray.io/node-id": node_id("north")}))
     status_of("full", "waiting")
-    fleet.add(streams["gate"])  # it may run anywhere, and only this node has room
+    fleet.add(GATE)  # it may run anywhere, and only this node has room
     status_of("gate", node="south")
     fleet.remove("full", forget=True)
     stored = Store(spec.store).stream("gate")

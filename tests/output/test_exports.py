@@ -39,7 +39,6 @@ ANNOTATED = [
     TrackedFrame([present(2, "", None), present(2, "anna", began=2)]),
     TrackedFrame([present(3, ""), present(3, "anna", None, began=2)]),
 ]
-CUT = [0.0, 20.0, 20.0, 40.0]
 
 
 def made(path, name=None, log=LOG, **about):
@@ -62,7 +61,7 @@ def test_coco_has_tracks_and_cuts_boxes_at_the_edges(tmp_path):
     assert coco.loadCats(coco.getCatIds()) == [{"id": 1, "name": "object"}, {"id": 2, "name": "anna"}]
     boxes = coco.loadAnns(coco.getAnnIds())
     assert [(each["image_id"], each["category_id"], each["track_id"], each["bbox"]) for each in boxes] == [
-        (1, 1, 1, [*BOX]), (1, 2, 2, CUT), (2, 1, 1, [*BOX]), (3, 2, 3, [*BOX]), (4, 1, 1, [*BOX]),
+        (1, 1, 1, [*BOX]), (1, 2, 2, [0.0, 20.0, 20.0, 40.0]), (2, 1, 1, [*BOX]), (3, 2, 3, [*BOX]), (4, 1, 1, [*BOX]),
     ]  # fmt: skip
     assert [each["attributes"]["doubtful"] for each in boxes] == [False, False, True, False, False]
     assert (boxes[1]["area"], boxes[1]["score"], boxes[1]["iscrowd"]) == (800.0, 0.75, 0)

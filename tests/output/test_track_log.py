@@ -29,9 +29,8 @@ from catstream.processes.job import Results
 from catstream.video.source import open_source
 from catstream.wire.messages import Track
 
-BOX = Box(10.0, 20.0, 30.5, 40.0)
 TRACKS = [
-    Track(0, 0.0, "bootstrapping", BOX, 1.0, 0, checked="keyframe", probability=1.0),
+    Track(0, 0.0, "bootstrapping", Box(10.0, 20.0, 30.5, 40.0), 1.0, 0, checked="keyframe", probability=1.0),
     Track(1, 0.04, "absent", None, 0.125, 3, checked="checked", probability=0.975),
     Track(3, 0.12, "present", Box(-2.0, 21.0, 30.0, 40.0), 0.75, 4, 17.5),
 ]

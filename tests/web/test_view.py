@@ -14,7 +14,6 @@ import pytest
 from catstream.cli.view import HostPortType, token_of_page
 
 PATHS = ["/", "/events", "/live.mjpeg", "/pictures/1.jpg", "/metrics", "/streams/roof/", "/streams/roof/events"]
-OTHER_USER = 65534
 
 
 @contextmanager
@@ -22,7 +21,7 @@ def another_user():
     """Run as another user of the machine if this one is root; without the token, a server cannot tell them apart."""
     is_root = os.geteuid() == 0
     if is_root:
-        os.seteuid(OTHER_USER)
+        os.seteuid(65534)
     try:
         yield
     finally:
