@@ -157,7 +157,7 @@ class Arena:
                 self.frames.append(message.frame)
             else:
                 self.end = message
-            self._children["detector"].memory.owner.read = math.inf if self.end is not None else message.seq
+            self._children["detector"].memory.consumer.read = math.inf if self.end is not None else message.seq
         elif monotonic() - self._last_received > _PATIENCE_SECONDS:
             raise ServiceError(
                 f"no track arrived for {_PATIENCE_SECONDS:.0f} s after {len(self.tracks)}: {self.words()}"

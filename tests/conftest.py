@@ -365,7 +365,7 @@ def managing():
     @contextmanager
     def manage(status, address="", keys=""):
         current = status if callable(status) else lambda: status
-        with closing(RegistryServer(address, keys, current)) as server, _turning(server.turn):
+        with closing(RegistryServer(address, keys, current)) as server, _turning(server.serve):
             yield server.endpoint
 
     return manage

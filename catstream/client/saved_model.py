@@ -30,7 +30,7 @@ from catstream.errors import MissingFileError, ProtocolError, ServiceError, Sett
 from catstream.features.layout import ROW_LENGTH
 from catstream.wire import storage
 from catstream.wire.heads import TREES
-from catstream.wire.messages import LARGEST_GIVEN_MODEL, LARGEST_GIVEN_MODELS, Features, Model
+from catstream.wire.messages import LARGEST_INITIAL_MODEL, LARGEST_INITIAL_MODELS, Features, Model
 from catstream.wire.schema import check_message
 from catstream.wire.storage import Metadata, pack, unpack
 
@@ -71,7 +71,7 @@ class SavedModel:
         ServiceError if the trees have no leaf yet, or the object was not found yet.
         """
         state = compressor.detector
-        if state is not None and state.is_sought:
+        if state is not None and state.is_searched:
             raise ServiceError("the object of the saved model was not found yet, so there is nothing new to save")
         if compressor.box is None or state is None or not compressor.version:
             raise ServiceError("nothing was learned of the object yet, so there is nothing to save")
@@ -194,15 +194,15 @@ def check_sizes(sizes: Mapping[str, int]) -> None:
     """Raise SettingsError if the saved models of objects, by name, are too large to begin in one frame."""
     advice = "track fewer at once, or train them again with a smaller coreset.size"
     for name, size in sizes.items():
-        if size > LARGEST_GIVEN_MODEL:
+        if size > LARGEST_INITIAL_MODEL:
             raise SettingsError(
                 f"the saved model of {listed([name])} is too large ({size >> 20} MiB, limit "
-                f"{LARGEST_GIVEN_MODEL >> 20}): {advice}"
+                f"{LARGEST_INITIAL_MODEL >> 20}): {advice}"
             )
-    if (total := sum(sizes.values())) > LARGEST_GIVEN_MODELS:
+    if (total := sum(sizes.values())) > LARGEST_INITIAL_MODELS:
         raise SettingsError(
             f"the saved models of {listed(sizes)} are too large for one frame ({total >> 20} MiB together, limit "
-            f"{LARGEST_GIVEN_MODELS >> 20}): {advice}"
+            f"{LARGEST_INITIAL_MODELS >> 20}): {advice}"
         )
 
 

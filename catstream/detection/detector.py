@@ -106,7 +106,7 @@ class Detector:
             return Detection(score, Window.around(box).with_centre_in(*frame.size))
         context = self._context(frame, seq)
         self.state = belief.predict_window(self._current_state())
-        if self.state.is_sought and self.similarity is not None:
+        if self.state.is_searched and self.similarity is not None:
             self.state, detection = search.seek(context, self.state, self.similarity)
             return detection
         return search.find(context, self.state)
@@ -129,7 +129,7 @@ class Detector:
         if self._is_explained(detection, seq) or self._is_still(detection, seq):
             return self._result(seq, time, detection.score, {})
         context, training = self._context(frame, seq), {}
-        if state.is_sought and self.similarity is not None:
+        if state.is_searched and self.similarity is not None:
             training = teacher.training_of_background(context, detection.window, self.similarity)
         elif self._policy(state).teach:
             training = teacher.training_of(context, state.window, detection.around)

@@ -205,7 +205,7 @@ def assign(detections: Mapping[str, Detection], states: Mapping[str, DetectorSta
     which more than a third is in the box of a certain object, or of an object with a higher score. A certain object
     loses its position to an uncertain one only if the score of the uncertain one is clearly higher.
     """
-    claims = [Claim(name, detections[name], state) for name, state in states.items() if not state.is_sought]
+    claims = [Claim(name, detections[name], state) for name, state in states.items() if not state.is_searched]
     # Step 1: an object is not certain if an uncertain one scores clearly higher at its position.
     for claim, other in permutations(claims, 2):
         claim.is_certain &= not claim.yields_to(other)

@@ -1,6 +1,6 @@
-"""Starts one process of a pipeline by hand: `services/detector.py`, `compressor.py` and `trainer.py` call it.
+"""The command line of one process of a pipeline, for `services/detector.py`, `compressor.py` and `trainer.py`.
 
-They may be started in any order, as the three containers do; `catstream track` starts and supervises them all.
+They may be started manually in any order, for example in three containers. `catstream track` starts and supervises all.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def main(name: str) -> None:
 
 def parser(name: str) -> ArgumentParser:
     """The arguments of a process."""
-    made = ArgumentParser(
+    arguments = ArgumentParser(
         prog=f"services/{name}.py",
         description=_ABOUT[name],
         epilog=_EXAMPLE,
@@ -57,25 +57,25 @@ def parser(name: str) -> ArgumentParser:
         allow_abbrev=False,
     )
     setting = "One setting; may be repeated."
-    made.add_argument("--set", dest="pairs", action="append", default=[], metavar="GROUP.NAME=VALUE", help=setting)
+    arguments.add_argument("--set", dest="pairs", action="append", default=[], metavar="GROUP.NAME=VALUE", help=setting)
     if name != "trainer":
-        made.add_argument("--state", type=Path, help="Folder for the checkpoints or the desired state.")
+        arguments.add_argument("--state", type=Path, help="Folder for the checkpoints or the desired state.")
     if name == "detector":
-        made.add_argument("source", metavar="SOURCE", help="A video, a folder of images, a camera or a stream.")
+        arguments.add_argument("source", metavar="SOURCE", help="A video, a folder of images, a camera or a stream.")
         box = "An object in the first frame, in pixels; may be repeated with names. Empty: none."
-        made.add_argument("--box", action="append", default=[], metavar="[NAME=]X,Y,W,H", help=box)
+        arguments.add_argument("--box", action="append", default=[], metavar="[NAME=]X,Y,W,H", help=box)
         model = "Search for the object of a saved model; may be repeated with names. Empty: none."
-        made.add_argument("--model", action="append", default=[], metavar="[NAME=]FILE", help=model)
+        arguments.add_argument("--model", action="append", default=[], metavar="[NAME=]FILE", help=model)
         resume = "Continue after the last message of an earlier detector."
-        made.add_argument("--resume", action="store_true", help=resume)
-    return made
+        arguments.add_argument("--resume", action="store_true", help=resume)
+    return arguments
 
 
 def _by_name(option: str, texts: list[str]) -> dict[str, str]:
-    """The values of an option by the names of their objects, without empty ones; ObjectError if two have one name."""
+    """The non-empty values of an option by object name; ObjectError if a name is not unique."""
     texts = [text for text in texts if text]
     values = dict(split_name(text) for text in texts)
     if len(values) < len(texts):
-        given = " ".join(f"--{option} {text}" for text in texts)
-        raise ObjectError(f"duplicate object ({given}): give each object its own name")
+        options = " ".join(f"--{option} {text}" for text in texts)
+        raise ObjectError(f"duplicate object ({options}): give each object its own name")
     return values

@@ -21,41 +21,36 @@ from catstream.wire.channels import CONTROL
 from catstream.wire.commands import Responder
 from catstream.wire.messages import Answer, Command
 
-_RETRY_SECONDS = 5.0  # from one attempt to store the desired state to the next
+_RETRY_SECONDS = 5.0  # interval between two attempts to store the desired state
 
 
 class Commands(AbstractContextManager["Commands"]):
-    """The commands of a run, and the state that they have set; a context manager.
-
-    desired  the desired state; `change` stores another one
-    models   the saved models that objects begin with
-    boxes    the commands `set-box` that wait for a frame
-    """
+    """The commands of a run, and the desired state that they set; a context manager."""
 
     def __init__(self, process: Process, detectors: Detectors) -> None:
         self._process, self._detectors = process, detectors
-        self.models = ModelFiles(process.state / SEARCHED)
+        self.models = ModelFiles(process.state / SEARCHED)  #: saved models of searched objects
         self._file, self._read_problem = process.state / DESIRED, ""
-        self.desired = self._first_state(process.job)
-        self.boxes: list[Command] = []
+        self.desired = self._initial_state(process.job)  #: the desired state; set it with `change`
+        self.boxes: list[Command] = []  #: commands `set-box` that wait for a frame
         self._responder: Responder[Command, Answer] = Responder(CONTROL, process.endpoint, longest=CONTROL.limit)
-        self._stored: DesiredState | None = None  # in the file
-        self._tried = 0.0  # when it was last stored, or could not be
-        self._paused_until = 0.0  # end of a pause that ends by itself, as its sender may be gone
-        # The last message of an earlier detector: its frames are repeated before a command or a pause applies.
+        self._stored: DesiredState | None = None  # the desired state in the file
+        self._tried = 0.0  # time of the last attempt to store it
+        self._paused_until = 0.0  # end of a pause with a timeout
+        # Last message of an earlier detector: its frames are repeated before commands and pauses apply.
         self._repeated = math.inf if process.job.resume else 0.0
         self.store_and_answer()
 
     def __exit__(self, *_: object) -> None:
         self._responder.close()
 
-    def _first_state(self, job: Job) -> DesiredState:
-        """The desired state at the start: the stored one if the run is resumed, otherwise from the job."""
+    def _initial_state(self, job: Job) -> DesiredState:
+        """The initial desired state: the stored one if the run is resumed, otherwise the job's."""
         if job.resume and self._file.exists():
             try:
                 desired = DesiredState.load(self._file)
                 return replace(desired, paused=desired.paused or job.paused)
-            except ProtocolError as error:  # the checkpoints are not affected, so the run continues
+            except ProtocolError as error:  # continue: the checkpoints are intact
                 self._read_problem = str(error)
         boxes = {name: DesiredObject(box, begins=1) for name, box in job.boxes.items()}
         saved = {name: self.models.add(SavedModel.load(file)) for name, file in job.models.items()}
@@ -63,7 +58,7 @@ class Commands(AbstractContextManager["Commands"]):
 
     @property
     def apply(self) -> bool:
-        """True if commands and pauses apply: the frames of an earlier detector were repeated."""
+        """True if commands and pauses apply, because all frames of an earlier detector were repeated."""
         return self._detectors.seq >= self._repeated
 
     @property
@@ -72,12 +67,12 @@ class Commands(AbstractContextManager["Commands"]):
         return self.desired.paused or monotonic() < self._paused_until
 
     @property
-    def hold(self) -> bool:
-        """True if no frames are tracked because the run is paused, or waits for a box."""
+    def suspended(self) -> bool:
+        """True if no frames are tracked because the run is paused or waits for a box."""
         return self.apply and (self.paused or not self.desired.objects)
 
     def resume(self, start: Start) -> None:
-        """Continue with the objects of a process that died, after the frames that it has to repeat."""
+        """Continue with the objects of a process that died; commands apply once its frames were repeated."""
         self._repeated = start.repeats
         self.change(start.desired)
 
@@ -87,7 +82,7 @@ class Commands(AbstractContextManager["Commands"]):
         self.store_and_answer()
 
     def execute(self) -> bool:
-        """Execute the commands that have arrived; returns whether there were any. Boxes wait for a frame."""
+        """Execute the received commands; `set-box` waits for a frame. Returns True if there were any."""
         if not self.apply:
             return False
         ending = self._process.ending
@@ -121,7 +116,7 @@ class Commands(AbstractContextManager["Commands"]):
         return answered
 
     def _saved_model(self, command: Command) -> DesiredObject | None:
-        """The object that the saved model in a command begins."""
+        """The desired object for the saved model in a command, or None."""
         if command.model is None:
             return None
         self._process.watchdog.allow()
@@ -130,7 +125,7 @@ class Commands(AbstractContextManager["Commands"]):
         return self.models.add(saved)
 
     def take_boxes(self) -> list[Command]:
-        """The boxes that wait for a frame; they wait no longer."""
+        """Remove and return the commands that wait for a frame."""
         boxes, self.boxes = self.boxes, []
         return boxes
 
@@ -139,14 +134,14 @@ class Commands(AbstractContextManager["Commands"]):
         self.store_and_answer(answer(command, self._detectors, False, reason))
 
     def reject_boxes(self, reason: str) -> None:
-        """Reject the boxes that wait for a frame, because there is none."""
+        """Reject the commands that wait for a frame."""
         for command in self.take_boxes():
             self.reject(command, reason)
 
     def store_and_answer(self, *answers: Answer) -> None:
-        """Store the desired state if it has changed, then reply; the reply carries the error if saving failed.
+        """Store the desired state if it has changed, then reply. If saving failed, the reply contains the error.
 
-        `execute` tries that again after some seconds.
+        `execute` retries after some seconds.
         """
         desired, problem = self.desired, ""
         if desired != self._stored:
@@ -157,19 +152,19 @@ class Commands(AbstractContextManager["Commands"]):
                     desired.save(self._file)
                 self._stored = desired
             except ServiceError as error:
-                problem = f"{error}; until then, a resumed run does not know the newest commands"
+                problem = f"{error}; until then, a resumed run lacks the newest commands"
         self._process.trouble = "; ".join(filter(None, (self._read_problem, problem)))
-        if desired == self._stored:  # otherwise the file may name a model that is not needed any more
+        if desired == self._stored:  # otherwise the file may refer to a model that is no longer desired
             self.models.keep_only({item.model for item in desired.objects.values()})
         for answered in answers:
             reason = f"{answered.reason}; {problem}" if answered.done and problem else answered.reason
             self._responder.answer(replace(answered, reason=reason))
 
     def begin_end(self) -> None:
-        """No frame follows: the boxes that wait are rejected, and so is every further command except `save`."""
+        """Begin the shutdown: pending boxes are rejected, as are all further commands except `save`."""
         self._repeated = 0.0
         self.reject_boxes(f"the pipeline is ending: {self._process.ending.reason}")
 
     def allow_resume(self) -> None:
-        """Store that a resumed run does not stop at once, although a command has stopped this one."""
+        """Clear the stored command `stop`, so that a resumed run does not stop at once."""
         self.change(replace(self.desired, stopped=False))

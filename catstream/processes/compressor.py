@@ -1,4 +1,4 @@
-"""The process that compresses features in coreset trees, stores the trees on disk, and sends samples."""
+"""The process that compresses features in coreset trees, writes checkpoints of the trees, and sends samples."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from catstream.wire.endpoint import Endpoint
 from catstream.wire.messages import End, Features, ModelFile, Position
 from catstream.wire.newest import Publisher
 
-_LOCK_SECONDS = 10.0  # limit for an earlier compressor to end
-_SENDER_SECONDS = 5.0  # limit for the detector to send the end, once this process was asked to end
-_SAVED_MODEL_SECONDS = 1.0  # shortest time between two files of one object, for subscribers that save it
+_LOCK_SECONDS = 10.0  # timeout for an earlier compressor to end
+_SENDER_SECONDS = 5.0  # timeout after a signal for the detector to send the end of the stream
+_SAVED_MODEL_SECONDS = 1.0  # minimum interval between two files of one object
 
-ridge.prepare()  # once in the start server, not in each process
+ridge.prepare()  # once in the start server instead of in each process
 
 
 def main(process: Process) -> None:
@@ -50,7 +50,7 @@ def main(process: Process) -> None:
 
 
 class CompressorLoop:
-    """A forest, its checkpoints, and the sockets that it is connected to."""
+    """Connects the forest of coreset trees to its checkpoints and sockets."""
 
     def __init__(self, process: Process, stack: ExitStack) -> None:
         settings, endpoint = process.settings, process.endpoint
@@ -60,8 +60,9 @@ class CompressorLoop:
         self._forest.skip_to(process.job.first)
         seq = self._forest.seq
         self._position = Position(seq, seq, versions=self._forest.versions)
-        self._tried, self._took = monotonic(), 0.0  # when the last checkpoint was tried; duration of one without sync
-        self._sync_at = 0.0  # when the next one is durable
+        self._tried = monotonic()  # time of the last attempt to write a checkpoint
+        self._took = 0.0  # duration of the last checkpoint that was not synced
+        self._sync_at = 0.0  # time from which the next checkpoint is synced
         check, states, window = self._check, self._forest.states_at, settings.run.unstored_frames
         self._features = stack.enter_context(Receiver(ALL_FEATURES, endpoint, self._position, window, check, states))
         self._samples = stack.enter_context(Publisher(SAMPLES, endpoint))
@@ -71,13 +72,13 @@ class CompressorLoop:
 
     @property
     def must_stop(self) -> bool:
-        """True if the process was asked to end, and a connected detector did not send its end in time."""
+        """True after a signal, once a connected detector has had its time to send the end of the stream."""
         window = self._features.window
         seconds = _SENDER_SECONDS if window.connected and not window.ended else 0
         return self._process.ending.seconds_since_signal >= seconds
 
     def receive(self) -> Features | End | None:
-        """The next message, None if none arrives in a tenth of a second."""
+        """The next message, None after a timeout."""
         return self._features.receive(MESSAGE_SECONDS)
 
     def insert(self, features: Features) -> None:
@@ -85,7 +86,7 @@ class CompressorLoop:
         before = self._forest.compressors.keys()
         if any(part.model for part in features.objects.values()):
             self._process.watchdog.allow()
-        beat = self._process.watchdog.beat  # after each object: all of them together may take long on a slow machine
+        beat = self._process.watchdog.beat  # after each object: on a slow machine, all objects may exceed the limit
         for sample in self._forest.take(features, continued(features, self._process.settings), beat):
             self._samples.send(sample)
             beat()
@@ -102,14 +103,14 @@ class CompressorLoop:
         if seq > self._stored and (urgent or checkpoint_is_due(monotonic() - self._tried, self._took, interval)):
             self._store(urgent, is_end)
         if message is not None or self._position is not before:
-            # Samples count without a checkpoint, because in lockstep the detector waits for their models.
+            # Announce samples before their checkpoint: in lockstep, the detector waits for their models.
             position = replace(self._position, processed=seq, versions=self._forest.versions)
             features.acknowledge(with_end(position, message.seq) if isinstance(message, End) else position)
         features.answer()
 
     @property
     def _stored(self) -> int:
-        """Number of the newest message that is in a checkpoint."""
+        """Number of the newest message in a checkpoint."""
         return self._position.seq - self._position.in_memory
 
     def _store(self, urgent: bool, is_end: bool) -> None:
@@ -118,7 +119,7 @@ class CompressorLoop:
         durable = self._process.job.state is not None and (is_end or began >= self._sync_at)
         saved = self._checkpoints.save(self._forest, durable=durable)
         self._tried = monotonic()
-        if saved and durable:  # its duration does not count: the next one is not synced
+        if saved and durable:  # do not measure it: the next one is not synced
             self._sync_at = began + sync_interval(self._checkpoints.size)
         else:
             self._took = self._tried - began
@@ -129,12 +130,12 @@ class CompressorLoop:
         if end is not None:
             self._samples.send(end)
         self._samples.serve_late_joiners()
-        self._saved_models.turn(self._forest.compressors, self._process.watchdog.beat)
+        self._saved_models.serve(self._forest.compressors, self._process.watchdog.beat)
         self._process.trouble = self._checkpoints.trouble
         self._process.beat(self._counters, self._forest.object_counters, now=end is not None)
 
     def stop(self) -> None:
-        """Store all received messages; the sender continues with the next compressor."""
+        """Write a final checkpoint and acknowledge it; the sender continues with the next compressor."""
         if self._forest.seq > self._stored:
             self._store(urgent=False, is_end=True)
             self._features.acknowledge(
@@ -152,18 +153,18 @@ class CompressorLoop:
 
 
 class SavedModels(Publisher[ModelFile]):
-    """Sends the trees of each object after each new sample, at most once a second; nothing without subscribers."""
+    """Publishes the trees of each object after each new sample, at most once a second, if there are subscribers."""
 
     def __init__(self, endpoint: Endpoint, settings: Settings) -> None:
         super().__init__(SAVED_MODELS, endpoint)
         self._settings = settings
         self._sent: dict[str, tuple[int, float]] = {}  # version and time of the last file of each object
 
-    def turn(self, compressors: Mapping[str, Compressor], after_each: Callable[[], object]) -> None:
-        """Send the files that are due, with `after_each` after each; call it in every turn, as subscribers may join."""
+    def serve(self, compressors: Mapping[str, Compressor], after_each: Callable[[], object]) -> None:
+        """Send pending files, and call `after_each` after each. Call once per iteration, to serve new subscribers."""
         self.serve_late_joiners()
         if not self.has_subscribers:
-            if self._sent:  # the next subscriber gets new files only
+            if self._sent:  # late joiners receive new files only
                 self._sent.clear()
                 self.keep_only(())
             return
@@ -175,8 +176,8 @@ class SavedModels(Publisher[ModelFile]):
 
     def _send(self, name: str, compressor: Compressor) -> None:
         try:
-            learned = SavedModel.of(compressor, self._settings)
-        except ServiceError:  # the object of a saved model has not been found yet
+            saved = SavedModel.of(compressor, self._settings)
+        except ServiceError:  # the object of a saved model was not detected yet
             return
-        self.send(ModelFile(compressor.version, learned.to_bytes(), name))
+        self.send(ModelFile(compressor.version, saved.to_bytes(), name))
         self._sent[name] = compressor.version, monotonic()

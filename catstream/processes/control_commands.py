@@ -13,7 +13,7 @@ from catstream.errors import ObjectError
 from catstream.processes.decisions import DesiredObject, DesiredState
 from catstream.wire.messages import Answer, Command
 
-#: The reason of a stream's end, if a command stopped it.
+#: Reason of the end of a stream that a command stopped.
 STOPPED = "it was stopped by a command"
 
 #: The desired state after a command, and the answer to it.
@@ -23,7 +23,7 @@ Outcome = tuple[DesiredState, Answer]
 def execute(
     command: Command, desired: DesiredState, detectors: Detectors, model: DesiredObject | None = None
 ) -> Outcome:
-    """The desired state after a command that needs no frame, and the answer; `model` begins an object for `search`.
+    """The desired state and the answer for a command that needs no frame; `model` is the desired object of `search`.
 
     ObjectError or SettingsError if it cannot be executed. The `detectors` are not changed.
     """
@@ -32,7 +32,7 @@ def execute(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Execution:
-    """A command in its circumstances, with a method for each verb: see `execute`."""
+    """The arguments of `execute`, with a method for each verb."""
 
     command: Command
     desired: DesiredState
@@ -43,7 +43,7 @@ class _Execution:
         seconds = self.command.seconds
         if self.desired.paused or seconds is None:
             return self._done(replace(self.desired, paused=True), f"paused {self._moment}")
-        if seconds > 0:  # it ends by itself, and changes nothing that is stored
+        if seconds > 0:  # a pause with a timeout is not stored
             return self._done(self.desired, f"paused for {seconds:g} s {self._moment}")
         return self.resume()
 
@@ -73,13 +73,13 @@ class _Execution:
         return desired, replace(answered, box=None, version=0)
 
     def save(self) -> Outcome:
-        """The client writes the file."""
+        """Check that there is a model; the client writes the file."""
         name = _tracked(self.command, self.desired)
         detector = self.detectors.detectors.get(name)
         if detector is None or detector.state is None or not detector.model.version:
-            problem = "nothing was learned of the object yet: try again once there is a model (catstream status)"
-        elif detector.state.is_sought:
-            problem = "the object of the saved model was not found yet: try again once it was"
+            problem = "the object has no model yet: try again later (catstream status shows the version)"
+        elif detector.state.is_searched:
+            problem = "the object of the saved model was not detected yet: try again once it was"
         else:
             return self._done(self.desired, f"model {detector.model.version} {self._moment}", name)
         return self.desired, answer(self.command, self.detectors, False, problem, name)
@@ -89,7 +89,7 @@ class _Execution:
 
     @property
     def _moment(self) -> str:
-        """When the command is executed, in words."""
+        """Description of the time of execution."""
         return f"after frame {self.detectors.seq - 1}" if self.detectors.seq else "before the first frame"
 
 
@@ -115,7 +115,7 @@ def answer(
 
 
 def object_of(command: Command, desired: DesiredState) -> str:
-    """The name of the object of a command: without a name, the object that has none, or the only one."""
+    """The name of the object of a command; by default the unnamed object, or the only one."""
     names = desired.objects
     if command.object or not names or UNNAMED in names:
         return check_name(command.object)
@@ -126,19 +126,19 @@ def object_of(command: Command, desired: DesiredState) -> str:
 
 
 def check_room(name: str, desired: DesiredState, most: int) -> None:
-    """Raise ObjectError if there is no room for an object of this name."""
+    """Raise ObjectError if a new object of this name would exceed the limit `most`."""
     if name not in desired.objects:
         check_count(len(desired.objects) + 1, most)
 
 
 def continues(command: Command, name: str, desired: DesiredState, detectors: Detectors) -> bool:
-    """Return True if a box continues the same object; one without a model begins again."""
+    """Return True if a box continues the same object; an object without a model begins again."""
     detector, current = detectors.detectors.get(name), desired.objects.get(name)
     return command.keep and bool(detector and detector.model.version and current and current.begins <= detectors.seq)
 
 
 def _tracked(command: Command, desired: DesiredState) -> str:
-    """The name of the object that a command is for; ObjectError if there is no such object."""
+    """The name of the tracked object of a command; ObjectError if there is no such object."""
     name, names = object_of(command, desired), desired.objects
     if not names:
         raise ObjectError("no object is tracked yet: set the box of one (set-box), or search for a saved model")

@@ -1,7 +1,6 @@
-"""Why and how far a process of a pipeline has ended.
+"""The shutdown of a process of a pipeline: by a signal, by the command `stop`, or because its source ends or fails.
 
-Only this module handles the signals that ask a process to end; the command `stop`, and a source that ends or fails, end
-a process here.
+Only this module handles SIGTERM and SIGINT.
 """
 
 from __future__ import annotations
@@ -14,16 +13,13 @@ from catstream.wire.messages import End
 
 
 class Ending:
-    """A process is running, then ending for a reason, and has ended.
-
-    reason  why no more frames are tracked; empty while the process is running
-    failed  whether the source failed
-    ended   whether the end of the stream was sent or received
-    """
+    """State of the shutdown: running, then ending for a reason, then ended."""
 
     def __init__(self) -> None:
-        self.reason, self.failed, self.ended = "", False, False
-        self._signal_time = math.inf  # at which the first signal arrived
+        self.reason = ""  #: reason of the shutdown; empty while the process is running
+        self.failed = False  #: whether the source failed
+        self.ended = False  #: whether the end of the stream was sent or received
+        self._signal_time = math.inf  # arrival time of the first signal
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, self._handle)
 
@@ -32,21 +28,21 @@ class Ending:
         self.begin("it was stopped")
 
     def begin(self, reason: str, *, failed: bool = False) -> None:
-        """End for a reason. The first one counts; but a source that fails is always an error."""
+        """Begin the shutdown. The first reason is kept, unless a later one is a failure of the source."""
         if failed or not self.reason:
             self.reason, self.failed = reason, failed
 
     def receive(self, end: End) -> None:
-        """Note the end of the stream, which was received or sent."""
+        """Record the end of the stream, which was received or sent."""
         self.begin(end.reason, failed=end.failed)
         self.ended = True
 
     @property
     def signalled(self) -> bool:
-        """True if a signal has asked the process to end."""
+        """True if a signal to end the process has arrived."""
         return self.seconds_since_signal >= 0
 
     @property
     def seconds_since_signal(self) -> float:
-        """Seconds since a signal asked the process to end; negative if none has."""
+        """Seconds since the first signal to end the process; negative before it."""
         return time.monotonic() - self._signal_time

@@ -1,7 +1,7 @@
 """The job of a run: its source, objects, settings and files.
 
-Whoever starts a run writes its job to one file, and every process of the run reads it there. A run with a state
-folder keeps a copy of the job in that folder, from which it is resumed.
+The program that starts a run writes its job to a file, which every process of the run reads. A run with a state folder
+is resumed from a copy of the job in that folder.
 """
 
 from __future__ import annotations
@@ -37,14 +37,14 @@ _ALL = slice(None)  # frames
 class Results:
     """The files that `catstream track` writes for a run; a resumed run continues the same files.
 
-    None stands for no file in a new run, and for the earlier ones in a resumed run.
+    None means no file in a new run, and an unchanged value in a resumed run.
 
     output      folder of the results files
     video       whether an annotated video is among the results files
     write       further files of tracks, see `catstream.output.destinations`
-    models      files for the model of each object, by name; a file without a name is for the only object
+    models      file for the model of each object, by name; an unnamed file is for the only object
     rotate      when the files of a live source are rotated, see `catstream.output.options.parse_rotation`
-    keep        number of rotated files that are kept of each
+    keep        maximum number of rotated files of each kind
     """
 
     output: Path | None = None
@@ -55,34 +55,34 @@ class Results:
     keep: int | None = None
 
     def after(self, earlier: Results) -> Results:
-        """The files of the earlier part of the run, replaced by these where they are set."""
+        """The files of the earlier part of the run, updated with these where they are set."""
         values = {field.name: getattr(self, field.name) for field in fields(self)}
         return replace(earlier, **{name: value for name, value in values.items() if value not in (None, {})})
 
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """Everything that the processes of a run have to agree on.
+    """The configuration that all processes of a run share.
 
-    source    the text that `catstream.video.source.open_source` takes
-    boxes     the objects in the first frame, by name; without a box or a model, the run waits for the box of a command
-    models    file that `catstream save` wrote of each object that is searched for, by name
-    part      the frames of the source that are followed
+    source    argument of `catstream.video.source.open_source`
+    boxes     initial boxes of the objects, by name; without a box or a model, the run waits for a command with a box
+    models    saved model (`catstream save`) of each searched object, by name
+    part      tracked frames of the source
     settings  all settings
-    size      width and height of a frame, None if that is not known yet
-    rate      frames per second, None if that is not known yet
+    size      width and height of a frame, None if unknown
+    rate      frames per second, None if unknown
     results   files that `catstream track` writes
     paused    whether the run starts paused, until the command `resume`
 
-    The others hold for one start of the run, and are not in the copy that is kept:
+    The other fields are for one start of the run, and are not in the stored copy:
 
-    endpoint  where the processes meet; the setting of the same name if this is empty
-    state     folder of the checkpoints and of the desired state; None if nothing is kept
+    endpoint  endpoint of the processes; the setting of the same name if this is empty
+    state     folder of the checkpoints and of the desired state; None to store nothing
     resume    whether the processes continue from that state
-    run       id of this start of the run, which its messages carry, and whose program receives every track on the
-              channel `results`; empty if the processes were started by hand
-    since     value of `time.monotonic` from which the times of a live source count; None for its first frame
-    first     number of its last frame before this start: of a live source, the newest checkpoint may be older
+    run       id of this start of the run, which its messages carry; the program that started it receives all tracks on
+              the channel `results`. Empty if the processes were started manually
+    since     value of `time.monotonic` at time 0 of a live source; None for its first frame
+    first     number of its last frame before this start: for a live source, the newest checkpoint may be older
     """
 
     source: str = field(default="", repr=False)  # it may contain a password
@@ -120,7 +120,7 @@ class Job:
         results: Results | None = None,
         paused: bool = False,
     ) -> Job:
-        """The job of a new run, by the arguments of `catstream.Pipeline`; SettingsError without a source."""
+        """The job of a new run, with the arguments of `catstream.Pipeline`; SettingsError without a source."""
         if not source:
             raise SettingsError("missing source: a new run needs a video, a folder of images, a camera or a stream")
         return cls(
@@ -142,7 +142,7 @@ class Job:
         results: Results | None = None,
         paused: bool = False,
     ) -> Job:
-        """The job of the next part of the run; arguments that are None keep their value."""
+        """The job of the next part of the run, with the arguments that are not None."""
         return replace(
             self,
             source=self.source if source is None else source,
@@ -153,7 +153,7 @@ class Job:
         )
 
     def save(self, folder: Path) -> Path:
-        """Write the job to a folder, readable by its owner only: the source may contain a password. Returns the file.
+        """Write the job to a private file in a folder, because the source may contain a password; returns its path.
 
         ServiceError if it cannot be written.
         """
@@ -165,9 +165,9 @@ class Job:
 
     @classmethod
     def load(cls, path: Path) -> Job:
-        """Read the job from the file that `save` wrote, or from the folder that it is in.
+        """Read the job from the file that `save` wrote, or from its folder.
 
-        ServiceError if there is no such file; ProtocolError or SettingsError if it is damaged, or was written by
+        ServiceError if the file does not exist; ProtocolError or SettingsError if it is damaged, or was written by
         another version of catstream.
         """
         file = path / JOB if path.is_dir() else path
@@ -190,7 +190,7 @@ class Job:
         return (self.part.start or 0) + frame * (self.part.step or 1)
 
     def check_fits(self, other: Job, folder: Path) -> None:
-        """Raise SettingsError if another job cannot continue this one, whose state is in `folder`."""
+        """Raise SettingsError if another job cannot continue this one; its state is in `folder`."""
         if other._frames() != self._frames():
             raise SettingsError(
                 f"the run in {str(folder)!r} has {self._frames()}, not {other._frames()}: "
@@ -203,7 +203,7 @@ class Job:
             )
 
     def _frames(self) -> str:
-        """The size and the numbers of the frames, for an error."""
+        """Description of the size and the numbers of the frames, for an error."""
         size = "" if self.size is None else f"{self.size[0]}x{self.size[1]} pixels, "
         first, stop, stride = self.part.start or 0, self.part.stop, self.part.step or 1
         numbers = f"frames {first} to {'the last' if stop is None else stop - 1}"
@@ -211,7 +211,7 @@ class Job:
 
 
 def changed_setting(before: Settings, after: Settings) -> str:
-    """The first setting that differs and is not `RESUMABLE`, with its values; empty if there is none.
+    """The first setting that differs and is not `RESUMABLE`, with both values; empty if there is none.
 
     >>> changed_setting(Settings(), Settings(coreset={"size": 32}, run={"lag_frames": 25}))
     'coreset.size=64, not 32'
@@ -222,13 +222,13 @@ def changed_setting(before: Settings, after: Settings) -> str:
 
 
 def files_by_name(files: Models | None) -> dict[str, Path]:
-    """Files by the names of their objects; a file without a name is for the only object."""
+    """Paths by object name; an unnamed file is for the only object."""
     named = files if isinstance(files, Mapping) else {} if files is None else {UNNAMED: files}
     return {name: Path(file) for name, file in by_name(named).items()}
 
 
 def _plain(value: object) -> object:
-    """A value in the types of JSON, if it is of a type that `msgspec` does not know."""
+    """Convert a value of a type that `msgspec` does not support to JSON."""
     if isinstance(value, slice):
         return [None if number is None else int(number) for number in (value.start, value.stop, value.step)]
     return str(value)
@@ -241,5 +241,5 @@ def _typed(kind: type, value: Any) -> object:
 
 @cache
 def _kinds() -> dict[str, Any]:
-    """The types of the fields of a job, by name, without its settings, which check themselves."""
+    """The types of the fields of a job by name, without its settings, which `Settings` checks."""
     return {name: kind for name, kind in get_type_hints(Job).items() if name != "settings"}

@@ -1,4 +1,4 @@
-"""The files of the saved models that objects begin with."""
+"""The saved models of searched objects, in memory and in files."""
 
 from __future__ import annotations
 
@@ -16,40 +16,37 @@ _log = logging.getLogger(__name__)
 
 
 class ModelFiles:
-    """The saved models that objects begin with: a restarted detector begins the objects again.
-
-    Each has a name, which is a digest of its content. They are in memory, and in a folder.
-    """
+    """Saved models in memory and in a folder, by a digest of their content: a restarted detector needs them again."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         self._models: dict[str, SavedModel] = {}
 
     def add(self, saved: SavedModel) -> DesiredObject:
-        """Keep a saved model in memory; returns the object that it begins in the first message, with its name."""
+        """Add a saved model in memory; returns a desired object that begins with it in the first message."""
         data = saved.to_bytes()
         name = blake2b(data, digest_size=16).hexdigest()
         self._models[name] = saved
         return DesiredObject(saved.box, 1, name, len(data), saved.model.version)
 
     def get(self, name: str) -> SavedModel | None:
-        """The saved model of a name, None if its file cannot be read."""
+        """The saved model with a name, None if its file is not readable."""
         if name not in self._models:
             try:
                 self._models[name] = SavedModel.load(self._file(name))
             except CatstreamError as error:
-                _log.warning("the object of a saved model is not searched for any more: %s", error)
+                _log.warning("the search for the object of a saved model was stopped: %s", error)
         return self._models.get(name)
 
     def store(self) -> None:
-        """Write the saved models in memory that have no file yet; OSError if that fails."""
+        """Write the saved models that have no file yet; OSError if this fails."""
         for name, saved in self._models.items():
             if not self._file(name).exists():
                 self._folder.mkdir(mode=0o700, parents=True, exist_ok=True)
                 write_atomically(self._file(name), saved.to_bytes(), mode=0o600)
 
     def keep_only(self, names: set[str]) -> None:
-        """Remove all other saved models; a file that cannot be removed now is removed by a later call."""
+        """Remove all other saved models; if a file cannot be removed, a later call retries."""
         self._models = {name: saved for name, saved in self._models.items() if name in names}
         with suppress(OSError):
             for file in self._folder.glob("*.safetensors"):

@@ -1,4 +1,4 @@
-"""The facts about a source that a job needs before its processes start."""
+"""Reads the properties of a source before the processes of a run start."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from catstream.video.source import open_source
 
 
 class SourceInfo(NamedTuple):
-    """A source, as its first frame says.
+    """The properties of a source.
 
-    name    for results: the stem of a file, or the name of a folder
-    frames  number of frames, None if it is not known
+    name    name for results: the stem of a file, or the name of a folder
+    frames  number of frames, None if unknown
     rate    frames per second
     size    width and height of a frame
     live    whether it is a camera or a stream
@@ -32,14 +32,14 @@ class SourceInfo(NamedTuple):
 
 
 def probe(job: Job) -> tuple[Job, SourceInfo]:
-    """The job with what depends on its source, and absolute paths: its processes have another current folder.
+    """Complete a job with the properties of its source, and make paths absolute.
 
-    The source is opened, and closed again: the detector opens it, and only one program can open a camera.
-    SettingsError if the settings do not suit the source, VideoError if it cannot be read; BoxError if a box is not in
+    The source is opened and closed again, because only one program at a time can open a camera.
+    SettingsError if the settings do not suit the source, VideoError if it cannot be read; BoxError if a box is outside
     the frame; ServiceError or ProtocolError if a saved model cannot be used.
     """
     if job.settings.run.lockstep and is_live(job.source):
-        raise SettingsError("a live source does not wait, so its runs are not reproducible: omit lockstep")
+        raise SettingsError("lockstep needs a file: a live source does not wait, so its runs are not reproducible")
     with open_source(job.source, part=job.part, settings=job.settings.run) as source:
         info = SourceInfo(source.name, source.frames, source.rate, source.size, source.live)
     check_boxes(job.boxes, *info.size)

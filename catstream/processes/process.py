@@ -1,4 +1,4 @@
-"""The frame of every process of the pipeline: signals, health, watchdog, exit codes, and its end with the parent."""
+"""The common part of every process of the pipeline: signals, health, watchdog, exit codes, and parent death."""
 
 from __future__ import annotations
 
@@ -29,48 +29,44 @@ from catstream.wire.messages import Health, run_state
 from catstream.wire.newest import Publisher, Subscriber
 from catstream.wire.rejects import rejected
 
-#: Exit code after an error that would occur again, such as an invalid setting: the process is not restarted.
+#: Exit code after an error that a restart would repeat, such as an invalid setting: the process is not restarted.
 PERMANENT_FAILURE = 2
 
-#: Exit code after the source failed, for example a damaged file: the process is not restarted either.
+#: Exit code after the source failed, for example a damaged file: the process is not restarted.
 SOURCE_FAILED = 3
 
-#: Exit code after a signal has ended a process of a supervisor before the end of the stream: it is restarted.
+#: Exit code after a signal has ended a supervised process before the end of the stream: it is restarted.
 STOPPED_EARLY = 4
 
-TURN_SECONDS = 0.02  #: the longest wait in a turn of a detector; from one look at the processes of a run to the next
-MESSAGE_SECONDS = 0.1  #: the longest wait of compressor and trainer for a message
-HEALTH_SECONDS = 1.0  #: between two health reports of a process
-_MISSING_SECONDS = 2.0  # without a health report, after which another process that was not started is named
+POLL_SECONDS = 0.02  #: polling interval of detector and supervisor
+MESSAGE_SECONDS = 0.1  #: timeout of compressor and trainer for a message
+HEALTH_SECONDS = 1.0  #: interval between two health reports of a process
+_MISSING_SECONDS = 2.0  # time after which processes without a health report are logged as missing
 
-#: Of the compressor and the trainer of a live source: the next frame does not wait for either of them. With 10, a busy
-#: machine starves the compressor, until frames wait for it. A file is tracked as fast as all three processes allow.
+#: Niceness of compressor and trainer for a live source, because frames do not wait for them. At 10, a busy machine
+#: starves the compressor until frames have to wait. For a file, all three processes limit the speed.
 _LIVE_NICENESS = 5
 
 _log = logging.getLogger(__name__)
 
 
 class Process:
-    """The state that every process of the pipeline has.
-
-    state            folder of the checkpoints and of the desired state; a private one, removed at the end, by default
-    trouble, source  description of a current problem, and the source; both are published with the health
-    ending           why and how far the process has ended
-    watchdog         counts the turns of the loop
-    owner            the owner of the run; None if the process was started by hand
-    """
+    """The common state of the processes of the pipeline."""
 
     def __init__(self, name: str, job: Job, handle: int | None = None) -> None:
         self.name, self.job, self.settings = name, job, job.settings
         endpoint = Endpoint.parse(job.endpoint or job.settings.run.endpoint, job.settings.run.keys)
-        # Of processes that were started by hand, only the detector knows that a run begins.
+        # If the processes were started manually, the detector creates the id of the run.
         self.endpoint = replace(endpoint, run=job.run or (token_hex(8) if name == "detector" else ""))
-        self.trouble = self.source = ""
+        self.trouble = ""  #: description of a current problem, published with the health
+        self.source = ""  #: the source, published with the health
         self.ending = Ending()
         memory = SharedMemory(handle)
-        self.watchdog, self.owner = memory.watchdog, memory.owner if job.run else None
+        self.watchdog = memory.watchdog
+        self.consumer = memory.consumer if job.run else None  #: None if the process was started manually
         self._stack = ExitStack()
         self._health = self._stack.enter_context(Publisher(HEALTH, self.endpoint, sender=name))
+        #: Folder of the checkpoints and of the desired state; by default a private one, removed at the end.
         self.state = job.state or self._stack.enter_context(private_folder())
         self._reported = 0.0
 
@@ -80,29 +76,29 @@ class Process:
         objects: Callable[[], dict[str, dict[str, float]]],
         now: bool = False,
     ) -> None:
-        """Count a turn of the loop; once a second or `now`, publish the health and release memory; for each turn."""
+        """Count an iteration of the loop; once a second, or if `now`, publish the health and release memory."""
         self.watchdog.beat()
         if now or time.monotonic() - self._reported >= HEALTH_SECONDS:
             self._reported = time.monotonic()
             own, state, trouble = counters() | {"rejected": float(rejected())}, None, self.trouble
             if self.name == "detector":
                 state = run_state(own)[0]
-                if self.owner is not None:
-                    of_results = self.owner.trouble.decode(errors="replace")
-                    own |= {"not_written": self.owner.not_written, "write_failed": float(bool(of_results))}
-                    trouble = "; ".join(filter(None, (trouble, of_results)))
+                if self.consumer is not None:
+                    write_error = self.consumer.trouble.decode(errors="replace")
+                    own |= {"not_written": self.consumer.not_written, "write_failed": float(bool(write_error))}
+                    trouble = "; ".join(filter(None, (trouble, write_error)))
             self._health.send(Health(self.name, time.time(), own, trouble, self.source, objects(), state))
             release_memory()
         else:
             self._health.serve_late_joiners()
 
     def close(self) -> None:
-        """Close the channel `health`, after its last message was sent."""
+        """Close the channel `health`, and remove a private state folder."""
         self._stack.close()
 
 
 def reset_process() -> None:
-    """Reset the signal mask, SIGCHLD and the limit of open files, which a process inherits from its parent."""
+    """Reset the inherited signal mask and handler of SIGCHLD, and raise the limit of open files to its maximum."""
     signal.pthread_sigmask(signal.SIG_SETMASK, ())
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)
     _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
@@ -114,13 +110,13 @@ def run(
 ) -> int:
     """Run the detector, the compressor or the trainer; return its exit code.
 
-    The code is 0 at the end of the stream, or after SIGTERM if the process was started by hand, without a parent;
-    otherwise one of the constants above. `restarted` means that it continues the work of a process that died.
+    The code is 0 at the end of the stream, or after SIGTERM without a `parent`, as the process was started manually;
+    otherwise one of the constants above. A `restarted` process continues the work of one that died.
     """
     if parent is not None:
         die_with(parent)
     reset_process()
-    logging.basicConfig(format=f"{name}: %(message)s", level=logging.INFO, force=True)  # the supervisor selects by it
+    logging.basicConfig(format=f"{name}: %(message)s", level=logging.INFO, force=True)  # supervisor: `ProcessLog`
     try:
         service = import_module(f"catstream.processes.{name}")
         job = Job.load(job) if isinstance(job, Path) else job
@@ -140,7 +136,7 @@ def run(
         _log.warning("%s", error)
         return 1
     except CatstreamError as error:
-        print(error, file=sys.stderr)  # without the name: a supervisor raises it, and does not log it too
+        print(error, file=sys.stderr)  # without the prefix, so the supervisor does not log it before it raises it
         return PERMANENT_FAILURE
     if process.ending.failed:
         return SOURCE_FAILED
@@ -148,7 +144,7 @@ def run(
 
 
 def _name_missing(name: str, endpoint: Endpoint) -> None:
-    """Log which other processes of a pipeline that is started by hand have sent no health report."""
+    """Log which other processes of a manually started pipeline have sent no health report."""
     missing, deadline = {*HEALTH.senders} - {name}, time.monotonic() + _MISSING_SECONDS
     with Subscriber(HEALTH, endpoint) as reports:
         while missing and (seconds := deadline - time.monotonic()) > 0:

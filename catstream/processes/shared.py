@@ -1,6 +1,6 @@
-"""Memory that a process shares with its supervisor: the descriptor `handle` is inherited.
+"""Memory that a process shares with its supervisor, by an inherited file descriptor.
 
-No value in it can be late or lost: a supervisor that was suspended reads the newest ones at once.
+Unlike messages, its values cannot be late or lost: a supervisor that was suspended reads the newest ones at once.
 """
 
 from __future__ import annotations
@@ -9,20 +9,20 @@ import ctypes
 import mmap
 import os
 
-RUNNING_SECONDS = 10.0  #: without an iteration of its loop, after which a process counts as stuck
-LONG_SECONDS = 120.0  #: the same for a start, and for a step that takes long and was announced
+RUNNING_SECONDS = 10.0  #: watchdog limit for an iteration of a process's loop
+LONG_SECONDS = 120.0  #: watchdog limit for the start, and for an announced long step
 
 
 class Watchdog(ctypes.Structure):
-    """Counts the iterations of the loop of a process, which stop with the loop even if other threads continue.
+    """Counts the iterations of the loop of a process. The count stops with the loop, even if other threads continue.
 
-    turns     number of iterations so far
-    patience  seconds that the current iteration may take
-    limit     seconds that an iteration may take without announcement
+    iterations  number of iterations so far
+    patience    limit in seconds for the current iteration
+    limit       default limit in seconds for an iteration
     """
 
-    _fields_ = (("turns", ctypes.c_double), ("patience", ctypes.c_double))
-    turns: float
+    _fields_ = (("iterations", ctypes.c_double), ("patience", ctypes.c_double))
+    iterations: float
     patience: float
     limit = RUNNING_SECONDS
 
@@ -31,18 +31,18 @@ class Watchdog(ctypes.Structure):
         self.allow(self.limit)
 
     def allow(self, seconds: float = LONG_SECONDS) -> None:
-        """Announce that the current iteration takes long."""
+        """Announce that the current iteration may take up to `seconds`."""
         self.patience = seconds
-        self.turns += 1
+        self.iterations += 1
 
 
-class Owner(ctypes.Structure):
-    """The progress of the program that owns the run: the detector waits for its reads, and reports its write errors.
+class Consumer(ctypes.Structure):
+    """Progress of the consumer of the results: the detector waits for its reads, and reports its write errors.
 
-    after        number of the last message that it had received when the process was started
-    read         number of the last message that it has read, infinite once it has received the end
-    not_written  frames that it could not write to its results
-    trouble      why it cannot write them, UTF-8; empty if it can
+    after        number of the last message received before the process was started
+    read         number of the last message read, infinite after the end
+    not_written  number of frames that could not be written to the results
+    trouble      current write error, UTF-8; empty if there is none
     """
 
     _fields_ = (
@@ -56,15 +56,15 @@ class Owner(ctypes.Structure):
 
 
 class SharedMemory:
-    """The two records, in the memory of a descriptor or in new memory."""
+    """The two records, in the memory of a file descriptor or in new memory."""
 
     def __init__(self, handle: int | None = None) -> None:
         self.handle = os.memfd_create("catstream") if handle is None else handle
-        size = ctypes.sizeof(Watchdog) + ctypes.sizeof(Owner)
+        size = ctypes.sizeof(Watchdog) + ctypes.sizeof(Consumer)
         os.truncate(self.handle, size)
         memory = mmap.mmap(self.handle, size)
         self.watchdog = Watchdog.from_buffer(memory)
-        self.owner = Owner.from_buffer(memory, ctypes.sizeof(Watchdog))
+        self.consumer = Consumer.from_buffer(memory, ctypes.sizeof(Watchdog))
         self.watchdog.allow()
 
     def close(self) -> None:

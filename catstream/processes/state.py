@@ -1,12 +1,11 @@
-"""The state of a pipeline on disk: what it needs to continue after a power cut.
+"""The state of a pipeline on disk, from which it continues after a power cut.
 
-    DIR/job.safetensors     the job of the run, readable by its owner only: see `catstream.processes.job`
-    DIR/desired_state.json  what was commanded: see `catstream.processes.decisions`
-    DIR/searched_models/    the saved models that objects are searched for by: see `catstream.processes.model_files`
+    DIR/job.safetensors     the job of the run, a private file: see `catstream.processes.job`
+    DIR/desired_state.json  the state that commands have set: see `catstream.processes.decisions`
+    DIR/searched_models/    the saved models of searched objects: see `catstream.processes.model_files`
     DIR/trees/              the compressor's checkpoints: see `catstream.coreset.checkpoint_store`
 
-A pipeline locks DIR, and its compressor DIR/trees. The kernel releases a lock when its process ends, however that
-happens.
+A pipeline locks DIR, and its compressor DIR/trees. The kernel releases a lock when its process ends, even by a crash.
 """
 
 from __future__ import annotations
@@ -40,30 +39,30 @@ DESIRED = "desired_state.json"
 
 _SMALL = (JOB, DESIRED)
 _LARGE = re.compile(rf"({CHECKPOINTS}/[0-9]+|{SEARCHED}/[0-9a-f]+)\.safetensors")
-_ATTEMPTS = 5  # to read a checkpoint that is replaced meanwhile
+_ATTEMPTS = 5  # to read a checkpoint that may be replaced concurrently
 
 _log = logging.getLogger(__name__)
 
 
 def contains_run(folder: Path) -> bool:
-    """Return True if a folder contains a run that can be resumed, whether or not that is complete."""
+    """Return True if a folder contains a run, complete or not, that can be resumed."""
     return (folder / JOB).exists()
 
 
 def files_of_state(folder: Path) -> dict[str, Path]:
-    """The folder and the files in it that nothing else may write, by their purpose."""
+    """The state folder and its files, which no other output may overwrite, by their purpose."""
     return {"the state folder": folder} | {f"{name} of the state": folder / name for name in (*_SMALL, CHECKPOINTS)}
 
 
 def position(folder: Path) -> tuple[int, float]:
-    """Number of the last message in the newest valid checkpoint, after which the run is resumed, and its time."""
+    """Number and time of the last message in the newest valid checkpoint, after which the run is resumed."""
     return CheckpointStore(folder / CHECKPOINTS).position()
 
 
 def learned(folder: Path, settings: Settings, name: str = UNNAMED) -> SavedModel:
-    """Everything that was learned of an object up to the newest valid checkpoint; "" is also the only object.
+    """The saved model of an object from the newest valid checkpoint; "" also means the only object.
 
-    ObjectError if there is no such object; ServiceError if nothing was learned before a checkpoint.
+    ObjectError if there is no such object; ServiceError if the checkpoint contains no model of it.
     """
     forest = CheckpointStore(folder / CHECKPOINTS).load(settings)
     if name == UNNAMED and len(forest.compressors) == 1:
@@ -75,13 +74,13 @@ def learned(folder: Path, settings: Settings, name: str = UNNAMED) -> SavedModel
 
 
 def files(folder: Path) -> dict[str, bytes]:
-    """The content of the files that a pipeline needs to continue from its newest checkpoint, by their names.
+    """The content of the files from which a pipeline can continue at its newest checkpoint, by name.
 
-    Empty if there is no checkpoint yet. The pipeline may be running.
+    Empty without a checkpoint. The pipeline may be running.
     """
     for _ in range(_ATTEMPTS):
-        with contextlib.suppress(FileNotFoundError):  # a newer file has just taken its place
-            # The desired state is read before the folder of the saved models that it names: they are stored before it.
+        with contextlib.suppress(FileNotFoundError):  # a newer file has just replaced it
+            # The desired state is read before the saved models to which it refers: they are stored before it.
             content = {name: (folder / name).read_bytes() for name in _SMALL if (folder / name).exists()}
             checkpoints = sorted((folder / CHECKPOINTS).glob("[0-9]*.safetensors"))
             for path in [*(folder / SEARCHED).glob("[0-9a-f]*.safetensors"), *checkpoints[-1:]]:
@@ -91,9 +90,9 @@ def files(folder: Path) -> dict[str, bytes]:
 
 
 def restore(folder: Path, content: Mapping[str, bytes]) -> None:
-    """Write what `files` returned to a new folder, from which a pipeline can be resumed.
+    """Write the result of `files` to a new folder, from which a pipeline can be resumed.
 
-    ServiceError if `files` does not return a name, or a file cannot be written.
+    ServiceError if a name is unknown or a file cannot be written.
     """
     for name, data in content.items():
         if name not in _SMALL and not _LARGE.fullmatch(name):
@@ -105,14 +104,14 @@ def restore(folder: Path, content: Mapping[str, bytes]) -> None:
 
 @contextlib.contextmanager
 def locked(folder: Path, seconds: float = 0.0) -> Iterator[Path]:
-    """Lock the folder of a state, as `locked_folder` does."""
+    """Lock a state folder; ServiceError if it is still locked after `seconds`."""
     busy = f"a running pipeline uses the state in {str(folder)!r}: stop it, or use another folder"
     with locked_folder(folder, seconds=seconds, mode=0o700, busy=busy):
         yield folder
 
 
 def check_new(folder: Path) -> None:
-    """Raise ServiceError if a folder contains a run, or a part of one."""
+    """Raise ServiceError if a folder contains a run or parts of one."""
     if contains_run(folder):
         hint = f"already contains a run: continue it (--resume {quote(str(folder))}), or use another folder"
     elif (folder / CHECKPOINTS).exists():
@@ -124,7 +123,7 @@ def check_new(folder: Path) -> None:
 
 @contextlib.contextmanager
 def locked_for_run(folder: Path, resumed: Job | None, job: Job) -> Iterator[None]:
-    """Lock the state folder, and store the job there if it is new or has changed."""
+    """Lock the state folder, and store the job in it if it is new or has changed."""
     with locked(folder):
         if resumed is None:
             check_new(folder)
@@ -137,7 +136,7 @@ def locked_for_run(folder: Path, resumed: Job | None, job: Job) -> Iterator[None
 def saved(
     files: Mapping[str, Path], state: Path, settings: Settings, report: Callable[[Path], object]
 ) -> Iterator[None]:
-    """Save what was learned of each object to its file afterwards, and report each file that was saved.
+    """Save the model of each object to its file afterwards, and call `report` with each saved file.
 
     An error of the run takes precedence over errors of saving.
     """

@@ -23,7 +23,7 @@ from catstream.base.addresses import is_live
 from catstream.base.clock import RunningClock
 from catstream.errors import ServiceError, VideoError
 from catstream.processes.job import Job
-from catstream.processes.process import PERMANENT_FAILURE, SOURCE_FAILED, STOPPED_EARLY, TURN_SECONDS
+from catstream.processes.process import PERMANENT_FAILURE, POLL_SECONDS, SOURCE_FAILED, STOPPED_EARLY
 from catstream.processes.shared import SharedMemory
 from catstream.processes.start_server import NAMES, StartedProcess, start_server, starting
 from catstream.wire.channels import HEALTH
@@ -104,7 +104,7 @@ class Child:
     def start(self, after: int) -> None:
         """Start the process; the program has the frames up to message `after`."""
         self.end()
-        self.memory.owner.after = self.memory.owner.read = after
+        self.memory.consumer.after = self.memory.consumer.read = after
         self.memory.watchdog.allow()
         self.silent, self.hung = 0.0, False
         self.log.begin()
@@ -128,7 +128,7 @@ class Child:
 
     def check(self, seconds: float) -> bool:
         """Return True if the loop has been stuck for longer than the watchdog limit."""
-        before, self._iterations = self._iterations, self.memory.watchdog.turns
+        before, self._iterations = self._iterations, self.memory.watchdog.iterations
         self.silent = self.silent + seconds if before == self._iterations and self.code is None else 0.0
         return self.silent > self.memory.watchdog.patience
 
@@ -222,7 +222,7 @@ class Supervisor:
             if self._frames and self._phase < Phase.STOPPING:
                 tracks = self._frames.popleft()
                 if self.end is None:
-                    self._children["detector"].memory.owner.read = tracks.seq
+                    self._children["detector"].memory.consumer.read = tracks.seq
                 return tracks.tracks
             if self._phase is Phase.RUNNING:
                 return {}
@@ -236,8 +236,8 @@ class Supervisor:
 
     def report_unwritten(self, frames: int, reason: str) -> None:
         """Report how many frames could not be written to the results, and why, with the health of the detector."""
-        owner = self._children["detector"].memory.owner
-        owner.not_written, owner.trouble = frames, reason.encode()[:1000]
+        consumer = self._children["detector"].memory.consumer
+        consumer.not_written, consumer.trouble = frames, reason.encode()[:1000]
 
     def stop(self) -> None:
         """End the processes in order, and receive what they still send; at once if this is interrupted."""
@@ -287,16 +287,16 @@ class Supervisor:
 
     def _iterate(self) -> None:
         """Receive the next frame or the end; at intervals, receive the health and check the processes."""
-        message = self._results.receive(TURN_SECONDS)
+        message = self._results.receive(POLL_SECONDS)
         if isinstance(message, End):
             self.end = message
-            self._children["detector"].memory.owner.read = math.inf
+            self._children["detector"].memory.consumer.read = math.inf
         elif message is not None:
             with self._changed:
                 self._frames.append(message)
                 self._changed.notify()
         before, now = self._checked, self._clock()
-        if now - before >= TURN_SECONDS:
+        if now - before >= POLL_SECONDS:
             self._checked = now
             self._receive_health()
             if self.end is None and self._phase < Phase.STOPPING:

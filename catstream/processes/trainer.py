@@ -1,4 +1,4 @@
-"""The process that trains models; always on the newest sample, as older ones are stale."""
+"""The process that trains a model on the newest sample of each object; older samples are skipped."""
 
 from __future__ import annotations
 
@@ -12,33 +12,33 @@ from catstream.wire.channels import MODELS, SAMPLES
 from catstream.wire.messages import End
 from catstream.wire.newest import Publisher, Subscriber
 
-_IMPORT_SECONDS = 2.0  # after the first block of centres: earlier, the import takes the time of the first tracks
+_IMPORT_SECONDS = 2.0  # delay after the first block of centres: an earlier import would delay the first tracks
 _NONE = {"version": 0.0, "trained": 0.0}
 
 
 def main(process: Process) -> None:
-    """Train a model from each sample that arrives, until the stream ends; the objects take turns."""
+    """Train models until the stream ends; the object that has waited longest is next."""
     trainer, run = Trainer(process.settings), process.settings.run
     preparation = Timer(_IMPORT_SECONDS, motion_em.prepare)
     trained: dict[str, dict[str, float]] = {}
     with Subscriber(SAMPLES, process.endpoint) as samples, Publisher(MODELS, process.endpoint) as models:
         while not process.ending.reason:
-            message = samples.receive(MESSAGE_SECONDS)  # of the object that has waited longest
+            message = samples.receive(MESSAGE_SECONDS)
             if isinstance(message, End):
                 process.ending.receive(message)
-            # An older version comes from a restarted compressor that lost the newer one; a detector may need its model.
+            # A restarted compressor may send an older version, whose model a detector may need.
             elif message is not None and message.version != trained.get(message.object, _NONE)["version"]:
                 process.watchdog.allow()
                 if len(message.centres) and not run.lockstep and run.lag_frames:
                     if preparation.ident is None:
                         preparation.start()
-                    if preparation.is_alive():  # train without motion: the detector does not wait for the import
+                    if preparation.is_alive():  # train without motion, so the detector does not wait for the import
                         message = replace(message, centres=message.centres[:0])
                 models.send(trainer.train(message))
                 count = trained.pop(message.object, _NONE)["trained"] + 1
                 trained[message.object] = {"version": float(message.version), "trained": count}
-                if len(trained) > process.settings.run.max_objects:  # the longest ago: it was forgotten
-                    del trained[next(iter(trained))]
+                if len(trained) > process.settings.run.max_objects:
+                    del trained[next(iter(trained))]  # trained the longest ago: it is no longer tracked
             models.serve_late_joiners()
             process.beat(lambda: _totals(trained), lambda: trained, now=process.ending.ended)
         process.watchdog.allow()
@@ -46,7 +46,7 @@ def main(process: Process) -> None:
 
 
 def _totals(trained: dict[str, dict[str, float]]) -> dict[str, float]:
-    """The counters of all objects together."""
+    """The counters over all objects."""
     return {
         "version": max((counters["version"] for counters in trained.values()), default=0.0),
         "trained": sum(counters["trained"] for counters in trained.values()),

@@ -1,9 +1,8 @@
-"""The acknowledged channel (`all-features`): every message arrives once and in order, whichever side is restarted.
+"""The acknowledged channel (`all-features`): every message arrives once and in order, even if a side is restarted.
 
-The receiver binds a ROUTER socket, the sender connects a DEALER. The protocol is go-back-N;
-`catstream.wire.go_back_n` describes and implements it. Here its two state machines are connected to sockets and to the
-clock. A frame without content asks for the position; one of digits also for the states after that message, and the word
-`newest` for the newest states.
+The receiver binds a ROUTER socket, the sender connects a DEALER. The protocol is go-back-N; `catstream.wire.go_back_n`
+describes and implements it. This module connects its two state machines to sockets and to the clock. An empty frame
+requests the position; the digits of a `seq` also request the states after that message, and `newest` the newest states.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ from catstream.wire.socket import LINGER_SECONDS, ChannelSocket
 
 _LONGEST_QUESTION = 20  # bytes
 _NEWEST = b"newest"
-_MOST_RESTARTS = 64  # senders that may wait for an answer at a time; any other asks again
+_MOST_RESTARTS = 64  # restarted senders that may wait for an answer; others repeat their question
 
 
 class _Numbered(Protocol):
@@ -39,10 +38,10 @@ Message = TypeVar("Message", bound=_Numbered)
 
 
 class Sender(ChannelSocket[Message]):
-    """The sending side of an acknowledged channel; at most `size` messages, fewer large ones, wait for their reply.
+    """The sending side of an acknowledged channel, with at most `size` unacknowledged messages (fewer large ones).
 
-    window   the messages that were sent, acknowledged and stored
-    replied  called after each reply, with the seq that the receiver has processed and its versions
+    window   counts of sent, acknowledged and stored messages
+    replied  called after each reply, with the newest processed seq and the versions of the samples
     """
 
     def __init__(
@@ -59,10 +58,7 @@ class Sender(ChannelSocket[Message]):
         self._connect()
 
     def ask_position(self, after: int | None) -> Position | None:
-        """Ask once for the position, and the states after message `after`, or the newest ones.
-
-        None if no answer arrived in time.
-        """
+        """Request the position, and the states after message `after` or the newest states; None on a timeout."""
         self._socket.poll(int(1000 * PATIENCE_SECONDS), zmq.POLLOUT)  # until it is connected
         self._ask(_NEWEST if after is None else b"%d" % after)
         if self._wait(PATIENCE_SECONDS):
@@ -70,22 +66,22 @@ class Sender(ChannelSocket[Message]):
         return None
 
     def send(self, message: Message) -> None:
-        """Send the message with the next seq, without waiting; ValueError if the window is full.
+        """Send the message with the next seq, without waiting.
 
-        ServiceError if the message is larger than the channel takes: it would never arrive.
+        ValueError if the window is full, ServiceError if the message exceeds the channel's limit.
         """
         self.poll(0)
         data = self._encode(message)
         if len(data) > self.channel.limit:
             raise ServiceError(
-                f"a message of {self.channel.name} takes {len(data) >> 20} MiB, more than {self.channel.megabytes}: "
+                f"a message of {self.channel.name} has {len(data) >> 20} MiB, more than {self.channel.megabytes}: "
                 "track fewer objects, or lower coreset.size"
             )
         self.window.push(message.seq, data)
         self._transmit()
 
     def poll(self, seconds: float) -> None:
-        """Process acknowledgements, waiting at most this long for the first; retransmit missing messages.
+        """Process acknowledgements, waiting up to `seconds` for the first; retransmit missing messages.
 
         Raises the errors of `SendWindow.receive`.
         """
@@ -102,27 +98,25 @@ class Sender(ChannelSocket[Message]):
         self.window.disconnected()
 
     def _transmit(self) -> None:
-        with contextlib.suppress(zmq.Again):  # tried again at the next poll
+        with contextlib.suppress(zmq.Again):  # `poll` retries
             self.window.transmit(self._send_frame)
 
     def _ask(self, question: bytes) -> None:
         self.window.asked(monotonic())
-        with contextlib.suppress(zmq.Again):  # no receiver is connected yet: it is asked again
+        with contextlib.suppress(zmq.Again):  # not connected yet: the request is repeated
             self._socket.send(question, zmq.NOBLOCK)
 
 
 class Receiver(ChannelSocket[Message]):
     """The receiving side of an acknowledged channel; it binds.
 
-    Each message that `receive` returns is processed, and then acknowledged. Senders that were restarted wait for
-    `answer`: what they have not sent themselves should be stored by then, as they cannot repeat it without the source.
+    The application processes each message of `receive`, then acknowledges it. Restarted senders wait for `answer`. The
+    application should store all messages before, because senders cannot repeat them without the source.
 
-    position  where the stream continues; the next message received is the one after `position.processed`
-    size      as the sender's
-    check     raises ProtocolError if a message does not belong to this stream; it then does not count as received
-    states    returns the states of the detectors after a message, or the newest ones, for a sender that was restarted
-    window    the messages that were received and stored
-    pending_restarts  the senders that were restarted and wait for `answer`, and the message whose states they ask for
+    position  position of the stream: the next message is the one after `position.processed`
+    size      size of the sender's window
+    check     raises ProtocolError if a message belongs to another stream; the message is dropped
+    states    returns the states of the detectors after a message, or the newest ones, for a restarted sender
     """
 
     def __init__(
@@ -136,12 +130,13 @@ class Receiver(ChannelSocket[Message]):
     ) -> None:
         super().__init__(zmq.ROUTER, channel, endpoint, high_water_mark=size + 1)
         self.window, self._check, self._states = ReceiveWindow(position, size), check, states
+        #: Restarted senders that wait for `answer`, each with the message whose states it requests (None: the newest).
         self.pending_restarts: dict[bytes, int | None] = {}
         self._size = size
         self._bind()
 
     def receive(self, seconds: float) -> Message | None:
-        """The next message in order, None if none arrived in time."""
+        """The next message in order, None after `seconds` or for any other frame."""
         if not self._wait(seconds):
             return None
         peer, data = self._receive_from_peer()
@@ -161,24 +156,24 @@ class Receiver(ChannelSocket[Message]):
         delivered, reply = self.window.receive(peer, message.seq, monotonic(), last=last, size=len(data))
         if reply is not None:
             self._reply(peer, reply)
-        if message.seq > self.window.processed + self._size + 1:  # more than a sender may have in flight
+        if message.seq > self.window.processed + self._size + 1:  # outside of the sender's window
             self._reject("sequence", f"message {message.seq} came after {self.window.processed}")
         return message if delivered else None
 
     def acknowledge(self, position: Position) -> None:
-        """Acknowledge all messages; up to `position.seq`, except the last `in_memory` ones, they are stored."""
+        """Acknowledge all messages; those up to `position.seq` are stored, except the last `in_memory` ones."""
         self.window.acknowledge(position)
         if self.window.peer is not None:
             self._reply(self.window.peer, self.window.position)
 
     def answer(self) -> None:
-        """Answer the senders that were restarted."""
+        """Answer all restarted senders."""
         for peer, after in self.pending_restarts.items():
             self._reply(peer, replace(self.window.asked(peer), states=self._states(after)))
         self.pending_restarts.clear()
 
     def close(self) -> None:
-        """Close, after the sender if it has sent its end: a connection that breaks may cost it the last reply."""
+        """Close; after the end of the stream, wait until the sender has closed, so that it receives the last reply."""
         if self.window.ended and self.window.connected:
             self._read_events(LINGER_SECONDS, until=Event.DISCONNECTED)
         super().close()
@@ -187,5 +182,5 @@ class Receiver(ChannelSocket[Message]):
         self.window.disconnected()
 
     def _reply(self, peer: bytes, position: Position) -> None:
-        with contextlib.suppress(zmq.Again):  # a sender that does not read asks again
+        with contextlib.suppress(zmq.Again):  # the queue is full: the sender repeats its request
             self._socket.send_multipart([peer, self._encode(position)], zmq.NOBLOCK)

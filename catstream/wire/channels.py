@@ -1,25 +1,24 @@
-"""The channels between the processes: their messages, their two ends, and their behaviour with slow readers.
+"""The channels between the processes: their messages, endpoints, and behaviour with slow receivers.
 
-    all-features   the training rows of each frame; every message is delivered exactly once: it is acknowledged, and
-               retransmitted to a restarted receiver
-    samples    only the newest of each object counts; a late joiner gets the last ones at once
-    models     as samples
-    tracks     every message, one for each object and frame, to any number of subscribers; a slow one misses some, and
-               sees by `frame` how many
-    results    the tracks again, one message a frame, for the program that started the pipeline, its owner
-    health     the newest of each process
-    previews   small pictures of the newest frame, made only for a subscriber
-    control    commands and their answers; a command without an answer is sent again, and executed once
-    saved-models   the newest coreset trees of each object as a file, made only for a subscriber
-    features   a copy of the training rows, sent only if there is a subscriber
+    all-features   the training rows of each frame, acknowledged, retransmitted, and delivered exactly once
+    samples        the newest of each object; late joiners receive the last ones at once
+    models         the newest of each object; late joiners receive the last ones at once
+    tracks         every message, one for each object and frame, to any number of subscribers; a slow subscriber misses
+                   messages, which it detects by `frame`
+    results        all tracks of a frame in one message, for the program that started the pipeline (its owner)
+    health         the newest of each process
+    previews       small pictures of the newest frame, made only for subscribers
+    control        commands and their answers; a command is repeated until it is answered, and executed once
+    saved-models   the newest coreset trees of each object as a file, made only for subscribers
+    features       a copy of the training rows, sent only to subscribers
 
-The controller of a fleet has an endpoint of its own, with one channel:
+The controller of a fleet has its own endpoint, with one channel:
 
-    registry   questions about the streams of the fleet, and their answers
+    registry       questions about the streams of the fleet, and their answers
 
-The one receiver of a channel binds its address; if there are many, its sender does. The rest connect, in any order.
-`catstream.wire.endpoint` says what the addresses are. If the pipeline has keys (`catstream.wire.keys`), a peer that
-connects needs the role in the table.
+The only receiver of a channel binds its address; with several receivers, the sender binds. The other side connects, in
+any order. `catstream.wire.endpoint` defines the addresses. If the pipeline has keys (`catstream.wire.keys`), a
+connecting peer needs the role in the table.
 """
 
 from __future__ import annotations
@@ -59,12 +58,12 @@ class Channel(Generic[Message]):
     name             the plural of the messages
     messages         kinds of message that it carries
     senders          processes that send, or "anyone"
-    receiver         the one process that every message is for, or None: any number of subscribers
+    receiver         the only receiver, or None for any number of subscribers
     keeps            "every" message, or the "newest"
-    port             offset from the first port; each further sender takes the next one
+    port             offset from the first port; further senders use the next ones
     megabytes        size of the largest message
-    role             role that a peer which connects needs at least
-    high_water_mark  how many messages a subscriber may lag behind before it misses some
+    role             minimum role of a connecting peer
+    high_water_mark  number of messages that a subscriber may lag behind before it misses some
     """
 
     name: str
@@ -89,7 +88,7 @@ class Channel(Generic[Message]):
 
 
 _ALL = ("detector", "compressor", "trainer")
-_FEATURES = 512  # MiB: an object takes 4.3 MB in its first frame, there are at most 64, and their saved models
+_FEATURES = 512  # MiB: 4.3 MB in the first frame of each of 64 objects, and their saved models
 
 ALL_FEATURES: Channel[Features | End] = Channel(
     "all-features", (Features, End), ("detector",), "compressor", "every", port=0, megabytes=_FEATURES
@@ -114,7 +113,7 @@ SAVED_MODELS: Channel[ModelFile] = Channel(
     "saved-models", (ModelFile,), ("compressor",), None, "newest", 11, 512, role="watch", high_water_mark=2
 )
 
-#: THE TABLE, by name.
+#: All channels of a pipeline, by name.
 CHANNELS: dict[str, Channel[object]] = {
     channel.name: channel
     for channel in (
@@ -136,7 +135,7 @@ PUBLIC: dict[str, Channel[object]] = {
     name: channel for name, channel in CHANNELS.items() if channel.role == "watch" and channel is not SAVED_MODELS
 }
 
-#: The only channel of the controller of a fleet, which is no process of a pipeline and has an endpoint of its own.
+#: The only channel of a fleet's controller, which has its own endpoint.
 REGISTRY: Channel[Question | Listing] = Channel(
     "registry", (Question, Listing), ("anyone",), "controller", "every", port=0, megabytes=16, role="watch"
 )

@@ -1,12 +1,11 @@
-"""Messages to bytes and back. Everything that arrives is checked before it is used.
+"""Encodes messages as bytes, and decodes them. Every received message is validated before use.
 
 A message is one frame of msgpack, `[version, kind, object, run, fields]`:
 
-    version   5; another one is rejected
-    kind      name of the message in small letters: "features", "track" ...
-    object    name of the object that the message is about, "" if it is about none or about all
-    run       id of the run that it is from: of one start of one pipeline, kept by processes that are restarted; "" if
-              the sender knows none
+    version   5; other versions are rejected
+    kind      name of the message in lower case: "features", "track" ...
+    object    name of the object that the message is about, or ""
+    run       id of the run: one start of one pipeline. Restarted processes keep it; "" if the sender does not know it
     fields    map from each field's name to its value, see `catstream.wire.messages`
     a box     [x, y, w, h]
     an array  {"dtype": "<f4" | "<f8", "shape": [...], "data": bytes, row by row, little-endian}
@@ -14,9 +13,9 @@ A message is one frame of msgpack, `[version, kind, object, run, fields]`:
 Version, kind and object are the first bytes of a message, and thus its topic: a subscriber may select one kind of
 message, and one object.
 
-msgpack packs and unpacks the bytes, within limits on the length of every text, list and map and on the number of all
-entries; msgspec converts the values to the fields of their kind, and skips all others. A sender checks
-what it sends in the same way, so that nothing leaves it that would be rejected on arrival.
+msgpack packs and unpacks the bytes, with limits on the length of every text, list and map and on the total number of
+entries. msgspec converts the values to the fields of the kind, and ignores unknown fields. A sender applies the same
+checks before it sends.
 """
 
 from __future__ import annotations
@@ -35,7 +34,7 @@ from catstream.wire.schema import LONGEST_LIST, LONGEST_TEXT, Integer, Text, che
 
 Message = TypeVar("Message")
 
-#: Version of the envelope and of the meaning of the fields.
+#: Version of the envelope and of the fields.
 VERSION = 5
 
 #: Kinds of message on all channels, and the reply on an acknowledged one, by their name on the wire.
@@ -43,8 +42,8 @@ KINDS: dict[str, type] = {
     kind.__name__.lower(): kind for channel in (*CHANNELS.values(), REGISTRY) for kind in channel.messages
 } | {"position": Position}
 
-_MOST_ENTRIES = 1 << 18  # of all lists and maps of a message, which take 25 MB at most; the schema allows 2**17
-_TOPIC_BYTES = 512  # that contain version, kind and object
+_MOST_ENTRIES = 1 << 18  # in all lists and maps of a message: at most 25 MB of memory; the schema allows 2**17
+_TOPIC_BYTES = 512  # upper limit for version, kind and object
 _BYTES = (bytes, memoryview)  # msgspec leaves them as they are; by default it would accept text for bytes
 
 
@@ -83,7 +82,7 @@ class _Entries:
 
 
 def encode(message: object, run: str = "") -> bytes:
-    """A message of a run as bytes; ProtocolError if it breaks its schema."""
+    """Encode a message of a run; ProtocolError if it violates its schema."""
     check_message(message)
     kind = type(message)
     values = msgspec.to_builtins(message, builtin_types=_BYTES, enc_hook=_plain)
@@ -93,12 +92,12 @@ def encode(message: object, run: str = "") -> bytes:
 
 
 def decode(data: bytes | memoryview, *kinds: type[Message]) -> Message:
-    """The message in `data`, one of `kinds`, with read-only arrays; ProtocolError if it is anything else."""
+    """Decode a message of one of `kinds`, with read-only arrays; ProtocolError if `data` is anything else."""
     return decode_with_run(data, *kinds)[0]
 
 
 def decode_with_run(data: bytes | memoryview, *kinds: type[Message]) -> tuple[Message, str]:
-    """The same, and the run that the message is from."""
+    """Decode a message as `decode` does; returns the id of its run as well."""
     envelope = _unpack(data)
     if envelope.version != VERSION:
         raise ProtocolError(
@@ -115,14 +114,14 @@ def decode_with_run(data: bytes | memoryview, *kinds: type[Message]) -> tuple[Me
 
 
 def opening(kind: type, about: str | None = None) -> bytes:
-    """The bytes that every message of a kind begins with; of those about one object, if a name is given."""
+    """The first bytes of every message of a kind, or of its messages about one object."""
     names = (kind.__name__.lower(),) if about is None else (kind.__name__.lower(), about)
     packed: bytes = msgpack.packb((VERSION, *names, *[None] * (4 - len(names))))
     return packed[: -(4 - len(names))]  # nil is one byte
 
 
 def topic_of(data: bytes) -> Topic:
-    """The topic of a message, by its first bytes; of no kind if they do not begin a message.
+    """The topic in the first bytes of a message; its kind is empty if they are invalid.
 
     >>> from catstream.wire.messages import End
     >>> topic_of(encode(End(0, "over")))
@@ -141,7 +140,7 @@ def topic_of(data: bytes) -> Topic:
 
 
 def decode_json(data: bytes, kind: type[Message]) -> Message:
-    """A message without arrays, from a JSON object of its fields; ProtocolError if it is anything else."""
+    """Decode a message without arrays from a JSON object; ProtocolError if `data` is anything else."""
     try:
         return msgspec.json.decode(data, type=kind)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
@@ -149,7 +148,7 @@ def decode_json(data: bytes, kind: type[Message]) -> Message:
 
 
 def _unpack(data: bytes | memoryview) -> _Envelope:
-    """Unpack a message. msgpack does not nest deeper than 1024 lists and maps, and copies each array once."""
+    """Unpack a message. msgpack limits the nesting to 1024 levels, and copies each array once."""
     entries = _Entries()
     try:
         values = msgpack.unpackb(
@@ -162,14 +161,14 @@ def _unpack(data: bytes | memoryview) -> _Envelope:
             max_ext_len=0,
         )
         return msgspec.convert(values, _Envelope)
-    except ValueError as error:  # msgpack raises no other, and the error of msgspec is a ValueError
+    except ValueError as error:  # the base class of the errors of msgpack and msgspec
         raise ProtocolError(
             f"expected [version, kind, object, run, fields] in msgpack: {str(error) or type(error).__name__}"
         ) from None
 
 
 def _convert(values: Any, kind: type[Message]) -> Message:
-    """The message of a kind that has these values."""
+    """Convert values by name to a message of a kind."""
     try:
         return msgspec.convert(values, kind, builtin_types=_BYTES, dec_hook=_array)
     except msgspec.ValidationError as error:
@@ -177,7 +176,7 @@ def _convert(values: Any, kind: type[Message]) -> Message:
 
 
 def _plain(value: object) -> dict[str, object]:
-    """An array as the map that is sent."""
+    """Convert an array to the map that is sent."""
     if isinstance(value, np.ndarray):
         array = np.ascontiguousarray(value, value.dtype.newbyteorder("<"))
         return {"dtype": array.dtype.str, "shape": array.shape, "data": array.data.cast("B") if array.size else b""}
@@ -185,7 +184,7 @@ def _plain(value: object) -> dict[str, object]:
 
 
 def _array(_: type, value: Any) -> np.ndarray:
-    """The array that `_plain` converted, in the same memory."""
+    """Convert the map of `_plain` to an array in the same memory."""
     array = msgspec.convert(value, _Array, builtin_types=_BYTES)
     if math.prod(array.shape) * np.dtype(array.dtype).itemsize != len(array.data):
         raise ValueError(f"{len(array.data)} bytes are not an array of {array.dtype} and shape {array.shape}")

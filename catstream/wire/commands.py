@@ -1,10 +1,10 @@
-"""Questions and their answers (`control`, `registry`): each is taken once, though its answer may get lost.
+"""Request/reply channels (`control`, `registry`): each question is handled once, even if its answer is lost.
 
 One process binds a ROUTER socket (`Responder`); any number of clients connect DEALER sockets (`Requester`). A client
-sends a question again until an answer with its `id` arrives: as soon as it is connected again if the connection broke,
-otherwise after a time that suits the size of the question. The responder remembers its last 64 answers, and repeats the
-answer to a question that it has answered already. A command is a question that asks for an action. At most 64 questions
-wait: any further command is rejected, except for "stop".
+repeats a question until an answer with its `id` arrives: at once after a reconnection, otherwise after a timeout that
+grows with the size of the question. The responder stores its last 64 answers, and sends the stored answer if a question
+is repeated. A command is a question that requests an action. At most 64 questions wait: further commands are rejected,
+except for "stop".
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from catstream.wire.messages import Answer as CommandAnswer
 from catstream.wire.messages import Command
 from catstream.wire.socket import ChannelSocket
 
-LOOK_SECONDS = 0.05  #: from one look at the connection to the next
-ANSWER_SECONDS = 5.0  #: limit for an answer, by default
-RETRY_BYTES_PER_SECOND = 1e6  #: of a slow network: a large question is sent again after so much longer
-_MAX_QUESTIONS = 64  # that wait, that are remembered with their answers, and that are received at once
-_LONGEST_QUESTION = 1 << 20  # bytes; once so many were received, the other questions wait
+LOOK_SECONDS = 0.05  #: interval between two checks of the connection
+ANSWER_SECONDS = 5.0  #: default timeout for an answer
+RETRY_BYTES_PER_SECOND = 1e6  #: assumed network speed, which extends the timeout of large questions
+_MAX_QUESTIONS = 64  # limit for waiting questions, stored answers, and questions received at once
+_LONGEST_QUESTION = 1 << 20  # bytes of a question, and total after which the next questions wait
 _MOST_QUEUED = 256 << 20  # bytes of questions that a socket queues for each client
 
 
@@ -41,20 +41,19 @@ Answer = TypeVar("Answer", bound=_HasId)
 
 
 class Requester(ChannelSocket[Question | Answer], Generic[Question, Answer]):
-    """Sends questions, the channel's first kind of message, and receives answers, its second; it connects."""
+    """Connects, sends questions (the channel's first kind of message) and receives answers (its second)."""
 
     def __init__(self, channel: Channel[Question | Answer], endpoint: Endpoint) -> None:
         super().__init__(zmq.DEALER, channel, endpoint, high_water_mark=_MAX_QUESTIONS)
         self._answer_kind = cast(type[Answer], channel.messages[1])
-        self._in_transit = False  # whether a question was sent, and the connection did not break since
-        # With ZMQ_IMMEDIATE, which queues nothing before there is a connection, libzmq would also drop an answer that
-        # was not read yet if the connection ends, as after "stop".
+        self._in_transit = False  # whether a question was sent on the present connection
+        # Not ZMQ_IMMEDIATE: when the connection ends, as after "stop", libzmq would drop an unread answer.
         self._is_connected = False
         self._socket.set(zmq.LINGER, 0)  # a question without a receiver is dropped
         self._connect()
 
     def ask(self, question: Question, seconds: float) -> Answer | None:
-        """Send a question until it is answered; None if no answer arrived in time."""
+        """Send a question repeatedly until it is answered; None after `seconds`."""
         data, clock = self._encode(question), RunningClock()
         now = repeat_at = 0.0
         while now < seconds:
@@ -67,11 +66,11 @@ class Requester(ChannelSocket[Question | Answer], Generic[Question, Answer]):
         return None
 
     def send(self, question: Question) -> None:
-        """Send a question once, without waiting for a connection or for the answer: `receive` returns it."""
+        """Send a question once, without waiting for a connection or the answer, which `receive` returns."""
         self._send(self._encode(question))
 
     def receive(self, question: str, seconds: float) -> Answer | None:
-        """The answer to the question with this id if it arrives in time; late answers to others are dropped."""
+        """The answer to the question with this id, None after `seconds`; answers to other questions are dropped."""
         deadline = monotonic() + seconds
         while self._wait(max(0.0, deadline - monotonic())):
             answer = self._decode(self._socket.recv(), self._answer_kind)
@@ -80,7 +79,7 @@ class Requester(ChannelSocket[Question | Answer], Generic[Question, Answer]):
         return None
 
     def _send(self, data: bytes) -> None:
-        self._read_events()  # those from before do not concern this question
+        self._read_events()  # an earlier disconnection does not concern this question
         self._in_transit = False
         with contextlib.suppress(zmq.Again):  # the responder does not read
             if self._is_connected:
@@ -95,7 +94,7 @@ class Requester(ChannelSocket[Question | Answer], Generic[Question, Answer]):
 
 
 class Responder(ChannelSocket[Question | Answer], Generic[Question, Answer]):
-    """Receives questions of at most `longest` bytes from any number of clients, and answers them; it binds."""
+    """Binds, receives questions of at most `longest` bytes from any number of clients, and answers them."""
 
     def __init__(
         self, channel: Channel[Question | Answer], endpoint: Endpoint, longest: int = _LONGEST_QUESTION
@@ -103,14 +102,14 @@ class Responder(ChannelSocket[Question | Answer], Generic[Question, Answer]):
         super().__init__(zmq.ROUTER, channel, endpoint, min(_MAX_QUESTIONS, _MOST_QUEUED // longest))
         self._socket.set(zmq.MAXMSGSIZE, longest)
         self._question_kind = cast(type[Question], channel.messages[0])
-        self._waiting: dict[str, bytes] = {}  # the peer that asked last, by the id of its question
-        self._answers: dict[str, bytes] = {}  # the last ones, by the id of their question
+        self._waiting: dict[str, bytes] = {}  # last sender of each unanswered question, by id
+        self._answers: dict[str, bytes] = {}  # last answers, by the id of the question
         self._bind()
 
     def receive_all(self, seconds: float = 0.0) -> list[Question]:
-        """The new questions, oldest first; each has to be answered. Repeated questions are left out.
+        """The new questions, oldest first; the caller must answer each. Repeated questions are omitted.
 
-        It waits so many seconds for the first one. A flood does not stop the process: the rest waits for the next call.
+        Waits up to `seconds` for the first one. A flood must not block the process: the rest waits for the next call.
         """
         questions: list[Question] = []
         received = size = 0
@@ -124,7 +123,7 @@ class Responder(ChannelSocket[Question | Answer], Generic[Question, Answer]):
         return questions
 
     def answer(self, answer: Answer) -> None:
-        """Answer a question, now and whenever it is repeated."""
+        """Answer a question, now and each time it is repeated."""
         self._answers[answer.id] = data = self._encode(answer)
         if len(self._answers) > _MAX_QUESTIONS:
             del self._answers[next(iter(self._answers))]
@@ -132,7 +131,7 @@ class Responder(ChannelSocket[Question | Answer], Generic[Question, Answer]):
             self._send(peer, data)
 
     def _accept(self, question: Question, peer: bytes) -> bool:
-        """Note the peer; returns whether the question is new. An earlier answer is repeated."""
+        """Return True if a question is new, and store its sender; repeat the answer to an answered one."""
         if (answer := self._answers.get(question.id)) is not None:
             self._send(peer, answer)
             return False
@@ -147,5 +146,5 @@ class Responder(ChannelSocket[Question | Answer], Generic[Question, Answer]):
         return False
 
     def _send(self, peer: bytes, data: bytes) -> None:
-        with contextlib.suppress(zmq.Again):  # a client that does not read asks again
+        with contextlib.suppress(zmq.Again):  # the queue is full: the client repeats the question
             self._socket.send_multipart([peer, data], zmq.NOBLOCK)

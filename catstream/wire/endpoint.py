@@ -1,8 +1,8 @@
 """Endpoints: the addresses of the sockets of a pipeline.
 
-An endpoint is a folder with one Unix socket for each channel (`FOLDER/features`), which only this user may enter; or
-`tcp://127.0.0.1:5700`, from which each channel takes the port that its row in the table says. With keys other machines
-may reach the host.
+An endpoint is a private folder with one Unix socket for each channel (`FOLDER/features`), or a TCP address such as
+`tcp://127.0.0.1:5700`, the first port, to which each channel adds its offset. With keys, the host may be reachable from
+other machines.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from catstream.errors import ServiceError
 from catstream.wire.channels import CHANNELS, REGISTRY, Channel
 from catstream.wire.keys import Keys
 
-_MAX_PATH_BYTES = 107  # of the name of a Unix socket, as the kernel limits it
+_MAX_PATH_BYTES = 107  # the kernel's limit for the path of a Unix socket
 _TCP = re.compile(r"tcp://(\*|[A-Za-z0-9_][A-Za-z0-9_.-]{0,252}|\[[^\[\]]+\]):([0-9]{1,5})")
-#: An address without its prefix, or another protocol: no folder, unless there is one of this name.
+#: An address without its prefix, or another protocol: not a folder, unless a folder of this name exists.
 _NO_FOLDER = re.compile(r".*://.*|.*:[0-9]{1,5}/?")
 
 
@@ -29,10 +29,10 @@ _NO_FOLDER = re.compile(r".*://.*|.*:[0-9]{1,5}/?")
 class Endpoint:
     """The address of the sockets of a pipeline: a folder, or a host and the first port; and the keys to connect with.
 
-    host    as ZeroMQ takes it
-    keys    to connect with; None if the pipeline has no keys
-    source  of the pipeline's frames, without a password; empty if it is not known here, or for a fleet
-    run     id of the run whose process this is; empty for a client
+    host    host in ZeroMQ's syntax
+    keys    keys of the connecting side; None if the pipeline has no keys
+    source  source of the pipeline's frames, without a password; empty if it is unknown, or for a fleet
+    run     id of the run of this process; empty for a client
 
     >>> Endpoint.parse("tcp://localhost:5700").address(CHANNELS["models"])
     'tcp://127.0.0.1:5702'
@@ -48,14 +48,14 @@ class Endpoint:
     run: str = field(default="", compare=False)
 
     def __str__(self) -> str:
-        """As the setting `run.endpoint` says it."""
+        """The endpoint in the syntax of the setting `run.endpoint`."""
         return str(self.folder) if self.folder is not None else f"tcp://{self.host}:{self.port}"
 
     @classmethod
     def parse(cls, text: str, keys: str | Keys = "") -> Endpoint:
-        """Read the settings `endpoint` and `keys`; the keys may have been loaded already.
+        """Parse the settings `endpoint` and `keys`; `keys` may be loaded already.
 
-        ServiceError if one of them is not valid, or if other machines can reach the host and there are no keys.
+        ServiceError if one of them is invalid, or if other machines can reach the host without keys.
         """
         if not text:
             raise ServiceError("this process needs the endpoint of its pipeline: --set run.endpoint=FOLDER")
@@ -84,7 +84,7 @@ class Endpoint:
         is_host = bool(host) and (address is not None or not host.startswith("["))
         if keys is None and is_host and (address is None or not address.is_loopback):
             raise ServiceError(
-                f"other machines can reach {text}, and without keys anybody could connect: make keys "
+                f"other machines can reach {text}, and without keys anyone could connect: make keys "
                 "(catstream keys new DIR) and pass them to all (--set run.keys=DIR), or use a folder or "
                 "tcp://127.0.0.1:PORT"
             )
@@ -93,14 +93,14 @@ class Endpoint:
         return cls(host=host, port=port, keys=keys)
 
     def address(self, channel: Channel[object], sender: str | None = None) -> str:
-        """The address of a channel, as ZeroMQ takes it; of the given sender if there are several."""
+        """The address of a channel in ZeroMQ's syntax; `sender` selects one of several senders."""
         sender = sender or channel.senders[0]
         if self.folder is not None:
             return f"ipc://{self.folder / _file(channel, sender)}"
         return f"tcp://{self.host}:{self.port + channel.port + channel.senders.index(sender)}"
 
     def listening(self, channel: Channel[object], sender: str | None = None) -> str:
-        """The address to listen on; the name of a host is resolved."""
+        """The address to listen on, with the host name resolved."""
         address = self.address(channel, sender)
         protocol, _, rest = address.partition("://")
         host, _, port = rest.rpartition(":")
@@ -111,37 +111,37 @@ class Endpoint:
 
     @property
     def is_ipv6(self) -> bool:
-        """True if the host has addresses of IPv6 only; ZeroMQ would not look for them."""
+        """True if the host has only IPv6 addresses, which ZeroMQ resolves only with the option IPV6."""
         return self.folder is None and [*resolved(self.host)] == [socket.AF_INET6]
 
     def is_in_use(self, channel: Channel[object], sender: str | None = None) -> bool:
-        """Return True if a process listens at a channel's Unix socket; ZeroMQ would replace it without an error."""
+        """Return True if a process listens at a channel's Unix socket, which ZeroMQ would replace silently."""
         if self.folder is None:
             return False
         with socket.socket(socket.AF_UNIX) as probe:
             return probe.connect_ex(self.address(channel, sender).removeprefix("ipc://")) == 0
 
     def lacks_sockets(self) -> bool:
-        """Return True if it is a folder without any socket: a pipeline removes all of its own at its end."""
+        """Return True for a folder without sockets: a pipeline removes its sockets at its end."""
         return self.folder is not None and not any(file.exists() for file in socket_files(self.folder))
 
     def hint(self, what: str = "a pipeline") -> str:
-        """What to check if nothing arrives from this endpoint."""
+        """A hint for the user if nothing arrives from this endpoint."""
         if self.lacks_sockets():
             if self.folder is not None and not self.folder.exists():
                 return f"is {what} running there? There is no folder {self.folder.absolute()}."
-            return f"is {what} running there? It has no sockets: if it runs, they were removed; start it again."
+            return f"is {what} running there? The folder has no sockets; if it runs, they were removed: restart it."
         return f"is {what} running there{f', with the keys in {self.keys.folder}' if self.keys is not None else ''}?"
 
     def check_access(self) -> None:
-        """Raise ServiceError if it is a folder that this user may not enter."""
+        """Raise ServiceError if this user may not enter the folder."""
         try:
             if self.folder is not None:
                 (self.folder / "control").exists()
         except PermissionError:
             raise ServiceError(
-                f"the folder {str(self.folder)!r} is of another user, and this one may not enter it: attach as the "
-                "user that runs the pipeline, or let it listen at tcp://127.0.0.1:PORT (--set run.endpoint=...)"
+                f"permission denied: the folder {str(self.folder)!r} belongs to another user. Attach as the user that "
+                "runs the pipeline, or let it listen at tcp://127.0.0.1:PORT (--set run.endpoint=...)"
             ) from None
 
 
@@ -153,7 +153,7 @@ def _address(host: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
 
 
 def resolved(host: str) -> dict[int, str]:
-    """One address of a host for each address family; empty if the host is unknown."""
+    """Resolve a host to one address of each address family; empty if the host is unknown."""
     try:
         addresses = socket.getaddrinfo(host.strip("[]"), None, type=socket.SOCK_STREAM)
     except OSError:
@@ -166,10 +166,10 @@ def _file(channel: Channel[object], sender: str) -> str:
 
 
 def is_too_long(folder: Path) -> bool:
-    """Return True if the kernel does not take the names of Unix sockets in a folder."""
+    """Return True if the paths of the Unix sockets in a folder exceed the kernel's limit."""
     return any(len(os.fsencode(file)) > _MAX_PATH_BYTES for file in socket_files(folder))
 
 
 def socket_files(folder: Path) -> Iterator[Path]:
-    """The socket of each channel in a folder, and of the registry."""
+    """Paths of the sockets of all channels in a folder, including the registry."""
     return (folder / _file(channel, sender) for channel in (*CHANNELS.values(), REGISTRY) for sender in channel.senders)

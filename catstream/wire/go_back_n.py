@@ -1,23 +1,23 @@
 """The acknowledged window: go-back-N retransmission as two state machines, without sockets and without a clock.
 
-Events and the time in seconds go in; frames to transmit and replies come out. `catstream.wire.acknowledged`
+Inputs are events and the time in seconds; outputs are frames to transmit and replies. `catstream.wire.acknowledged`
 connects the machines to sockets.
 
-The sender numbers its messages 1, 2, 3 ... (`seq`). It keeps a copy of each until the receiver acknowledges
-it: at most `size` copies, and no further one once they take 256 MiB. The receiver delivers each message to the
-application once and in order, and replies with a `Position` once the application has processed it: the sender drops its
-copies of stored messages.
+The sender numbers its messages 1, 2, 3 ... (`seq`). It keeps a copy of each until the receiver acknowledges it: at most
+`size` copies, and no further one once they take 256 MiB. The receiver delivers each message to the application once and
+in order. Once the application has processed it, the receiver replies with a `Position`, and the sender drops its copies
+of stored messages.
 
-If a message is missing, or a sender asks for the position on another connection than the last message, the reply
-says `again`: the sender transmits all messages after `processed` again. On the same connection none is lost; for
-the same reason the sender goes back once for several such replies. It asks if it was restarted, and after
-`PATIENCE_SECONDS` without a reply while messages wait. So either side may be restarted, any connection may break, and
-any reply may be lost: each message is still delivered once, in order. The end of the stream is delivered at any `seq`
-up to the next one: a restarted sender may end before it has repeated all that was delivered.
+If a message is missing, or if the position is requested on a new connection, the reply has `again` set: the sender
+retransmits all messages after `processed`. A connection loses no message while it lasts, so the sender goes back only
+once for several such replies. It requests the position after a restart, and after `PATIENCE_SECONDS` without a reply
+while messages wait. Therefore each message is delivered once and in order although either side may be restarted, any
+connection may break, and any reply may be lost. The end of the stream is delivered at any `seq` up to the next one: a
+restarted sender may end before it has repeated all delivered messages.
 
-A message may be acknowledged although it is only in memory, because the disk cannot be written (`Position.in_memory`).
-If such a receiver is restarted, the sender cannot retransmit it and raises `StreamRewoundError`: it has to make the
-messages again from the source.
+A message may be acknowledged while it is only in memory, because the disk is not writable (`Position.in_memory`). If
+such a receiver is restarted, the sender cannot retransmit the message and raises `StreamRewoundError`: it must produce
+the messages again from the source.
 """
 
 from __future__ import annotations
@@ -30,18 +30,18 @@ from dataclasses import replace
 from catstream.errors import ProtocolError, StreamRewoundError
 from catstream.wire.messages import Position
 
-PATIENCE_SECONDS = 0.2  #: without a reply, after which a question is sent again; between two reports of a gap
-AGAIN_SECONDS = 2.0  #: within which a sender goes back once only on the same connection
+PATIENCE_SECONDS = 0.2  #: timeout after which a request is repeated; minimum interval between reports of a gap
+AGAIN_SECONDS = 2.0  #: minimum interval between two retransmissions of the window on one connection
 
-_MOST_BYTES = 256 << 20  # total size of the copies at which no further one is added
+_MOST_BYTES = 256 << 20  # total size of the copies above which the window is full
 
 
 class SendWindow:
-    """The sender's side; `size` unacknowledged messages are kept at most, fewer if they are large.
+    """The sender's side, with at most `size` unacknowledged messages, fewer if they are large.
 
     sent          newest seq that was pushed
-    acknowledged  newest seq that the receiver will not ask for again while it lives
-    stored        newest seq that survives the receiver's death; below `acknowledged` while its disk cannot be written
+    acknowledged  newest seq that the receiver will not request again while it lives
+    stored        newest seq that survives the receiver's death; below `acknowledged` while its disk is not writable
     processed     newest seq that the receiver has processed
     """
 
@@ -51,15 +51,15 @@ class SendWindow:
         self._unacknowledged: deque[tuple[int, bytes]] = deque()  # oldest first
         self._bytes = 0  # their total size
         self._in_flight = 0  # how many of them were transmitted
-        self._sent_before = 0  # newest seq that a sender before this one may have sent
+        self._sent_before = 0  # newest seq that an earlier sender may have sent
         self._last_reply = now
-        self._went_back = -math.inf  # when it last did, on the present connection
+        self._went_back = -math.inf  # time of the last retransmission on the present connection
 
     def resume(self, seq: int, position: Position) -> None:
-        """Continue after message `seq` of an earlier sender, of which the receiver is at `position`."""
+        """Continue after message `seq` of an earlier sender; `position` is the receiver's."""
         self.sent = self.acknowledged = self.processed = seq
         self.stored = min(seq, position.seq - position.in_memory)
-        self._sent_before = position.processed + self._size  # a whole window of the earlier sender may be on its way
+        self._sent_before = position.processed + self._size  # the earlier sender may have had a full window in flight
 
     @property
     def full(self) -> bool:
@@ -70,41 +70,41 @@ class SendWindow:
         """Accept the next message for transmission; ValueError if the window is full."""
         if self.full:
             waiting = f"{len(self._unacknowledged)} of {self._bytes} bytes"
-            raise ValueError(f"message {seq} of {self._channel} was pushed while {waiting} are not acknowledged")
+            raise ValueError(f"cannot push message {seq} of {self._channel}: {waiting} are not acknowledged")
         self._unacknowledged.append((seq, frame))
         self._bytes += len(frame)
         self.sent = seq
 
     def transmit(self, send: Callable[[bytes], object]) -> None:
-        """Send each frame that was not transmitted yet, until all were or `send` raises an error."""
+        """Send the frames that were not transmitted yet, until `send` raises an error."""
         while self._in_flight < len(self._unacknowledged):
             send(self._unacknowledged[self._in_flight][1])
             self._in_flight += 1
 
     def must_ask(self, now: float) -> bool:
-        """Return True if a question is due: messages wait, and the last reply or question is `PATIENCE_SECONDS` ago."""
+        """Return True if messages wait and the last reply or request is more than `PATIENCE_SECONDS` old."""
         return bool(self._unacknowledged) and now - self._last_reply > PATIENCE_SECONDS
 
     def asked(self, now: float) -> None:
-        """Note that the position was asked for."""
+        """Record the time of a request for the position."""
         self._last_reply = now
 
     def receive(self, position: Position, now: float) -> bool:
         """Process a reply; returns False, and changes nothing, if it is older than the last one.
 
-        ProtocolError if the receiver has stored messages that were never sent, StreamRewoundError if it needs messages
-        that it had acknowledged before, and that were dropped here.
+        ProtocolError if the receiver has stored messages that were never sent, StreamRewoundError if it has lost
+        messages that it had acknowledged.
         """
         if position.seq > max(self.sent, self._sent_before):
             raise ProtocolError(
                 f"the receiver of {self._channel} has stored message {position.seq}, only {self.sent} were sent: "
-                "it holds another stream: restart it, or start this process with --resume"
+                "it has the state of another stream; restart it, or start this process with --resume"
             )
         if position.again:
             if position.processed < self.acknowledged:
                 raise StreamRewoundError(
                     f"the receiver of {self._channel} had {self.acknowledged} messages and now has "
-                    f"{position.processed}: what came between is made again from the source"
+                    f"{position.processed}: the others are produced again from the source"
                 )
         elif position.seq < self.acknowledged or position.processed < self.processed:
             return False
@@ -121,17 +121,17 @@ class SendWindow:
         return True
 
     def disconnected(self) -> None:
-        """The connection ended, and what was in flight may be lost."""
+        """Handle the end of the connection: messages in flight may be lost."""
         self._went_back = -math.inf
 
 
 class ReceiveWindow:
-    """The receiver's side: the stream continues with the message after `position.processed`; the sender keeps `size`.
+    """The receiver's side: the stream continues after `position.processed`; `size` is the sender's.
 
     processed      newest seq that was delivered; it is processed before `acknowledge` and the next `receive`
     ended      whether the sender has sent the end of the stream
-    connected  whether the sender of the newest message was still connected when a message was last awaited
-    peer       the sender of the newest message, to which acknowledgements go; None before the first
+    connected  whether the sender of the newest message is connected, by the events handled so far
+    peer       sender of the newest message, the recipient of acknowledgements; None before the first
     """
 
     def __init__(self, position: Position, size: int) -> None:
@@ -139,8 +139,8 @@ class ReceiveWindow:
         self.ended = self.connected = False
         self.peer: bytes | None = None
         self._position, self._size = position, size
-        self._bytes = 0  # total size of the messages that were delivered since all were stored
-        self._gap_reported = -math.inf  # when a missing message was last reported
+        self._bytes = 0  # total size of the messages delivered since all were stored
+        self._gap_reported = -math.inf  # time of the last report of a missing message
 
     @property
     def position(self) -> Position:
@@ -153,18 +153,18 @@ class ReceiveWindow:
         return 2 * (self.processed - self._position.seq) >= self._size or 2 * self._bytes >= _MOST_BYTES
 
     def asked(self, peer: bytes) -> Position:
-        """The reply to a sender that asks for the position."""
+        """The reply to a sender that requests the position."""
         return self.position if peer == self.peer else replace(self.position, again=True)
 
     def receive(
         self, peer: bytes, seq: int, now: float, last: bool = False, size: int = 0
     ) -> tuple[bool, Position | None]:
-        """A message of `size` bytes arrived; `last` says whether it is the end of the stream.
+        """Process a message of `size` bytes; `last` marks the end of the stream.
 
-        Returns whether it is the next one, to be given to the application; and the reply to its sender, if any.
+        Returns whether to deliver it to the application, and the reply to its sender, if any.
         """
-        ends = last and not self.ended  # also before a restarted sender has repeated what was delivered
-        if seq <= self.processed and not ends:  # retransmitted: the sender does not know that it arrived
+        ends = last and not self.ended  # even if a restarted sender has not repeated all delivered messages
+        if seq <= self.processed and not ends:  # a repeat: the sender has not received the acknowledgement
             return False, self.position
         if seq <= self.processed + 1:
             self.processed, self.ended, self._bytes = max(seq, self.processed), last, self._bytes + size
@@ -176,11 +176,11 @@ class ReceiveWindow:
         return False, replace(self.position, again=True)
 
     def acknowledge(self, position: Position) -> None:
-        """All messages are processed; up to `position.seq`, except the last `in_memory` ones, they are stored."""
+        """Set the position: messages up to `seq` are stored, except the last `in_memory` ones; all are processed."""
         self._position = position
         if position.seq >= self.processed:
             self._bytes = 0
 
     def disconnected(self) -> None:
-        """A connection ended: it may be the sender's."""
+        """Handle the end of a connection, possibly the sender's."""
         self.connected = False

@@ -1,4 +1,4 @@
-"""The tables of coreset trees and of heads: what the compressor summarises, and what the trainer computes from it.
+"""The tables of coreset trees and of heads, the linear models that the trainer fits to the trees.
 
 Compressor, trainer, checkpoint, codec, `catstream watch` and the page use these tables: a new tree or head is a new
 row.
@@ -8,11 +8,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-#: Training rows of windows at and around the object: label 1 the object, 0 background, between them a near miss.
+#: Training rows of windows at and around the object: label 1 for the object, 0 for background, between for near misses.
 APPEARANCE = "appearance"
-#: Training rows of windows of the right and of wrong sizes and aspects at the object: label 1 the right one, towards 0.
+#: Training rows of windows of several sizes and aspects at the object: label 1 for the right ones, lower for others.
 EXTENT = "extent"
-#: The head that predicts by how much a window is too large, and the one by how much it is too wide.
+#: The heads that predict the errors of a window's size and aspect.
 SIZE, ASPECT = "size", "aspect"
 
 
@@ -20,10 +20,10 @@ SIZE, ASPECT = "size", "aspect"
 class Head:
     """A ridge regression of one label of the rows of a tree.
 
-    penalty        of the ridge regression
+    penalty        L2 penalty of the regression
     adds_to_score  whether it adds to the weights of the score; otherwise it is in `Model.heads`
-    has_bias       if true, it predicts the label, with b in `Model.biases`. If false and it does not add to the score,
-                   it is fitted to the residual of the score
+    has_bias       if true, it predicts the label, with the bias in `Model.biases`. If false and it does not add to the
+                   score, it is fitted to the residual of the score
     """
 
     name: str
@@ -36,12 +36,12 @@ class Head:
 class Tree:
     """A coreset tree of each object.
 
-    group     group of the training rows that it takes
-    label     if given, it takes the feature rows x with this label only. If None, it takes all rows of the group with
-              their labels y, as [x, 1, y ...] * sqrt(weight). Then ||A [w; b; -1 at a label]||^2 is the squared error
-              of the linear model (w, b) of this label, which its head minimises
+    group     group of its training rows
+    label     if not None, only feature rows x with this label are inserted. If None, all rows of the group are inserted
+              with their labels y, as [x, 1, y ...] * sqrt(weight). Then ||A [w; b; -1 at a label]||^2 is the squared
+              error of the linear model (w, b) of this label, which its head minimises
     heads     the head of each label, in the order of their columns
-    required  whether no sample is made before it has a leaf, because the score needs it
+    required  whether a sample requires a leaf of this tree, because the score does
     title     title on the page
     meaning   description on the page
     """
@@ -56,7 +56,7 @@ class Tree:
 
     @property
     def more_columns(self) -> int:
-        """Number of its columns in addition to a feature row."""
+        """Number of columns in addition to a feature row."""
         return 1 + len(self.heads) if self.label is None else 0
 
 

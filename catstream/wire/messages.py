@@ -1,13 +1,13 @@
 """The messages between the stages.
 
-A message is frozen and complete by itself. In one process the stages pass the objects themselves. Between processes
-`catstream.wire` converts them to msgpack and back, and checks every field on arrival.
+A message is frozen and self-contained. Within one process, the stages pass the message objects. Between processes,
+`catstream.wire` encodes them with msgpack, and validates every field on arrival.
 
 The annotations are the schema (see `catstream.wire.schema`), and the docstrings describe the fields. The checks,
 the files of `catstream.wire.storage`, the tables of `docs/protocol.md` and the fuzzers are derived from both.
 
 `d` is the length of a feature row (`catstream.features.layout.ROW_LENGTH`), `n` the coreset size, frames count from 0.
-The objects of a stream have names (`catstream.base.names`); an object that is alone may have the name "".
+The objects of a stream have names (`catstream.base.names`); a single object may have the name "".
 """
 
 from __future__ import annotations
@@ -44,14 +44,14 @@ Level = Literal["lost", "redetected", "weak", "confident"]
 
 Verb = Literal["set-box", "search", "forget", "pause", "resume", "save", "stop"]
 
-#: Bytes of a saved model at most.
+#: Maximum size of a saved model, in bytes.
 LARGEST_MODEL = 511 << 20
 
-#: The same for a saved model that an object begins with.
-LARGEST_GIVEN_MODEL = 63 << 20
+#: Maximum size of a saved model with which an object begins, in bytes.
+LARGEST_INITIAL_MODEL = 63 << 20
 
-#: Bytes at most of all saved models that objects begin with in one frame: one message contains them.
-LARGEST_GIVEN_MODELS = 200 << 20
+#: Maximum total size of the models with which objects begin in one frame, in bytes: one message contains them.
+LARGEST_INITIAL_MODELS = 200 << 20
 
 #: The state of a run, see `run_state`: "lost" is its source, "waiting" is for a box.
 RunState = Literal["running", "lost", "waiting", "paused", "ended"]
@@ -69,7 +69,7 @@ _WITH_BIAS = {name: 0 for name, head in HEADS.items() if head.has_bias}
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """Parameters of the Kalman filter of the centre, found by EM (paper, section "Classification").
+    """Parameters of the Kalman filter of the centre, estimated by EM (paper, section "Classification").
 
     process      process noise covariance per frame of the constant-velocity model: x, y, then their speeds
     observation  covariance of a measured centre, pixels squared
@@ -81,15 +81,15 @@ class Motion:
 
 @dataclass(frozen=True, slots=True)
 class DetectorState:
-    """All that a detector knows after a frame, besides the model: with both, another one continues bit for bit.
+    """The state of a detector after a frame. With it and the model, another detector continues bit for bit.
 
     first_frame       number of the object's first frame
-    level             belief that the object was found
+    level             level of belief in the detection
     window            window of the object, the centre of the next search
     confident_window  window of the last confident frame; the best one while a saved model's object is searched for
     first_window      window of the first frame, None while a saved model's object is searched for
     trusted           false after a detection elsewhere, until the score is high
-    sightings         successive frames with a saved model's object in one place
+    sightings         successive frames with a saved model's object at one position
     motion            parameters of the Kalman filter, None before the first
     centre            its state, None before the first: mean (x, y, and their speeds) above covariance
     together          first frame of each earlier object whose box has always overlapped this one, by name
@@ -107,8 +107,8 @@ class DetectorState:
     together: ByObject[Integer] = field(default_factory=dict)
 
     @property
-    def is_sought(self) -> bool:
-        """True if the object of a saved model has not been found yet."""
+    def is_searched(self) -> bool:
+        """True while a saved model's object is searched for: it was not detected yet."""
         return self.first_window is None
 
 
@@ -131,7 +131,7 @@ class TrainingRows:
 
     @classmethod
     def labelled(cls, rows: np.ndarray, label: float | Sequence[float], weight: float = 1.0) -> Self:
-        """Rows of one weight, with one label or each its own."""
+        """Rows of equal weight, with one label for all or one each."""
         k = len(rows)
         return cls(np.asarray(rows, np.float32), np.full(k, label, np.float32), np.full(k, weight, np.float32))
 
@@ -139,7 +139,7 @@ class TrainingRows:
         return len(self.rows)
 
     def __add__(self, other: TrainingRows) -> TrainingRows:
-        """The rows of both, of a group without offsets."""
+        """Concatenate the rows of a group without offsets."""
         return TrainingRows(
             np.concatenate([self.rows, other.rows]),
             np.concatenate([self.labels, other.labels]),
@@ -152,7 +152,7 @@ class ObjectFeatures:
     """The part of `Features` for one object.
 
     box       box of the object, None if it was not found
-    training  rows of each group that has any
+    training  rows of each non-empty group
     detector  state of the detector after this frame, None before the first
     begins    whether a new object begins under this name, with empty trees
     model     saved model with which the object begins, otherwise empty
@@ -162,7 +162,7 @@ class ObjectFeatures:
     training: Annotated[dict[str, TrainingRows], Named(dict.fromkeys(GROUPS, 0))] = field(default_factory=dict)
     detector: DetectorState | None = None
     begins: bool = False
-    model: Annotated[bytes, Meta(max_length=LARGEST_GIVEN_MODEL)] = b""
+    model: Annotated[bytes, Meta(max_length=LARGEST_INITIAL_MODEL)] = b""
 
 
 class _Numbered:
@@ -197,11 +197,11 @@ class Position:
 
     seq        newest acknowledged message: the sender drops its copies up to this one
     processed  newest processed message
-    in_memory  number of acknowledged messages that are in memory only, because the disk cannot be written
+    in_memory  number of acknowledged messages that are in memory only, because the disk is not writable
     versions   version of the newest sample of each object
-    again      whether the sender has to send all messages after `processed` again
-    states     for a restarted sender: state of each object's detector after the message that it asked for, or after
-               the nearest known one
+    again      whether the sender must retransmit all messages after `processed`
+    states     for a restarted sender: state of each object's detector after the requested message, or after the nearest
+               known one
     """
 
     seq: Integer = 0
@@ -230,7 +230,7 @@ class Summary:
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """A training sample of all frames so far, compressor -> trainer; only the newest of each object is used.
+    """A training sample of all frames so far, compressor -> trainer; the newest of each object replaces older ones.
 
     version  1, 2, 3 ... over the samples of all objects
     frame    number of the newest summarised frame
@@ -254,13 +254,13 @@ class Model:
 
     version  version of the sample
     frame    number of the newest frame in the sample
-    weights  of the score of a window: weights @ row + bias
-    bias     so that the mean of the background scores 0, and the mean of the object 1
+    weights  weights of the score of a window: weights @ row + bias
+    bias     such that the mean of the background scores 0, and the mean of the object 1
     motion   parameters of the Kalman filter, None before the first EM
     heads    vector of each trained head that does not add to the score. A window fits well if
              (weights + heads["extent"]) @ row is high, and heads[name] @ row + biases[name] is near 0.5 for "size" and
              "aspect"
-    biases   bias of each of these heads that has one
+    biases   bias of each of these heads, if it has a bias
     object   name of the object
     began    number of the object's first frame
     """
@@ -282,8 +282,8 @@ class Model:
 class Track(_Numbered):
     """An object in one frame, detector -> anyone.
 
-    frame          number of the tracked frame, from 0, the same for all objects. A gap means missed messages, or that
-                   the object was not tracked
+    frame          number of the tracked frame, from 0, the same for all objects. A gap means that messages were missed
+                   or that the object was not tracked
     time           seconds since the start of the source, or of the run if the source is live
     state          "absent" without a box, "bootstrapping" with the model of the first frame (version 0), then "present"
     box            box of the object, in pixels of the frame; None while absent
@@ -291,11 +291,11 @@ class Track(_Numbered):
     model_version  version of the model of the score, 0 before the first
     pts            time stamp of a live stream, in seconds of its own clock; None for a file or without a stamp
     object         name of the object
-    began          number of the object's first frame. Another number is another object of the same name
+    began          number of the object's first frame. A different number means a new object of the same name
     doubtful       whether the box should be checked: the level of belief is "weak" or "redetected"
     source_frame   number of the frame in its file or folder: start + stride * frame; `frame` for a live source
-    checked        in an annotation: "keyframe" with a drawn box, "hidden" if a person said so and the box is estimated,
-                   "checked" if both directions agree, else "unchecked"
+    checked        in an annotation: "keyframe" with a drawn box, "hidden" if marked as hidden by a person and the box
+                   is estimated, "checked" if both directions agree, else "unchecked"
     probability    in an annotation: probability that the box, or its absence, is right
 
     >>> Track(12, 0.4, "present", Box(120.04, 80, 64, 48), 0.9314, 4)
@@ -329,14 +329,14 @@ class Track(_Numbered):
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """The fields by name, of plain types for JSON, as in FILE.ndjson: a box is a list [x, y, w, h], or None.
+        """The fields by name, with the types of JSON, as in FILE.ndjson: a box is a list [x, y, w, h], or None.
 
-        `checked` and `probability` are fields of an annotation only.
+        Only annotations have `checked` and `probability`.
 
         >>> Track(12, 0.4, "absent", None, 0.12, 4).to_dict()["box"] is None
         True
         """
-        values: dict[str, Any] = msgspec.to_builtins(self, enc_hook=lambda number: number.item())  # one of numpy
+        values: dict[str, Any] = msgspec.to_builtins(self, enc_hook=lambda number: number.item())  # NumPy scalars
         if self.box is not None:
             values["box"] = list(values["box"])
         if not self.checked:
@@ -346,7 +346,7 @@ class Track(_Numbered):
 
 @dataclass(frozen=True, slots=True)
 class Tracks(_Numbered):
-    """The tracks of one frame, detector -> the owner of the run; one message a frame.
+    """The tracks of one frame, detector -> owner (the program that started the run); one message a frame.
 
     frame   number of the frame: 0, 1, 2 ... without a gap
     tracks  the track of each object
@@ -382,7 +382,7 @@ class Preview:
 
 @dataclass(frozen=True, slots=True)
 class ModelFile:
-    """Everything that was learned of an object, compressor -> anyone.
+    """The trees and the model of an object, compressor -> anyone.
 
     version  version of the object's newest sample
     file     file that `catstream save` writes: all coreset trees, and a model
@@ -417,23 +417,23 @@ class Health:
 
 
 def run_state(counters: Mapping[str, float]) -> tuple[RunState, str]:
-    """The state of a run by the counters of its detector: the name of the first that holds, and all in words.
+    """The state of a run by the counters of its detector: the first that applies, and a description of all.
 
-    The single source of the state that commands, the page and /readyz show.
+    Commands, the page and /readyz all show this state.
 
     >>> run_state({"lost_seconds": 12.3, "paused": 1.0})
     ('lost', 'source lost for 12 s, paused')
     """
     if counters.get("ended"):
         return "ended", "ended"
-    holding: dict[RunState, str] = {}
+    states: dict[RunState, str] = {}
     if lost := counters.get("lost_seconds"):
-        holding["lost"] = f"source lost for {lost:.0f} s"
+        states["lost"] = f"source lost for {lost:.0f} s"
     if counters.get("waiting"):
-        holding["waiting"] = "waiting for a box"
+        states["waiting"] = "waiting for a box"
     if counters.get("paused"):
-        holding["paused"] = "paused"
-    return next(iter(holding), "running"), ", ".join(holding.values()) or "running"
+        states["paused"] = "paused"
+    return next(iter(states), "running"), ", ".join(states.values()) or "running"
 
 
 @dataclass(frozen=True, slots=True)
@@ -457,13 +457,14 @@ class End(_Numbered):
 class Command:
     """A control command to a running pipeline, anyone -> detector.
 
-    id       unique for each command: if it is received twice, it is executed once and answered twice
+    id       unique for each command. A command that is received twice is executed once and answered twice
     verb     the action
     box      "set-box": box of the object in the next tracked frame; in a paused file, in the current frame
-    keep     "set-box": whether it is the same object, whose trees and model are kept
+    keep     "set-box": whether the object keeps its trees and model, because it is the same object
     object   "set-box", "search", "forget", "save": name of the object
     model    "search": saved model of the object, which is searched for from the next frame on
-    seconds  "pause": time after which it ends by itself unless it is repeated; 0 ends it now. None: until "resume"
+    seconds  "pause": time after which the pause ends unless the command is repeated; 0 ends it now. None: until
+             "resume"
     time     "set-box" on a live source: time of the preview in which the box was drawn. While its frame is kept, the
              object is searched for from there to the next tracked frame
     boxes    "set-box", in place of `box` and `object`: boxes of several objects that begin in one frame
@@ -474,7 +475,7 @@ class Command:
     box: Box | None = None
     keep: bool = False
     object: ObjectName = ""
-    model: Annotated[bytes, Meta(max_length=LARGEST_GIVEN_MODEL)] | None = None
+    model: Annotated[bytes, Meta(max_length=LARGEST_INITIAL_MODEL)] | None = None
     seconds: Number | None = None
     time: Number | None = None
     boxes: ByObject[Box] = field(default_factory=dict)
@@ -492,7 +493,7 @@ class Answer:
 
     id       id of the command
     done     whether it was executed
-    reason   the effect, or the reason of a rejection
+    reason   the effect, or the reason of the rejection
     frame    number of the newest processed frame
     box      last box of the object, None if there is none
     version  version of the object's newest model, 0 before the first
@@ -510,19 +511,19 @@ class Answer:
 
 @dataclass(frozen=True, slots=True)
 class StreamStatus:
-    """The state of one stream of a fleet: where it runs, and how it is.
+    """The state and the location of one stream of a fleet.
 
     name            name of the stream, unique in its fleet
-    state           "waiting" for a box, "moving" between nodes, "stopping" if it is to run on none
+    state           "waiting" for a box, "moving" between nodes, "stopping" if it was removed from the fleet
     node            name of its node, empty if it runs on none
     source          video source without user and password
     endpoint        endpoint of its pipeline, as in `run.endpoint`; empty if it does not run
     server          public key of its sockets, empty without keys
     token           fencing token, larger for each new pipeline of the stream
-    live            whether the source is live: lost frames are not repeated, and their numbers are used again
+    live            whether the source is live: lost frames are not repeated, and their numbers are reused
     frame           number of the newest tracked frame
     skipped         frames of a live source that were skipped because the pipeline was too slow
-    missed          frames or events that its destinations lack, since its pipeline was started
+    missed          frames or events that its destinations have missed since its pipeline was started
     models          version of the newest model of each object
     present         whether each object is present in that frame; empty if no frames are tracked
     stored_seconds  seconds since the store had the newest state, None without one
@@ -554,7 +555,7 @@ class NodeStatus:
     state    "dead" if it does not answer Ray
     address  name or address of the machine
     cores    processor cores that streams may use
-    used     cores that are reserved for the streams on it
+    used     cores reserved for its streams
     labels   labels of the node, by name
     streams  number of streams on it
     """

@@ -10,18 +10,18 @@ from enum import Enum
 
 import zmq
 
-_POLLIN = int(zmq.POLLIN)  # an operation with a member of an enumeration would take half as long as to look
+_POLLIN = int(zmq.POLLIN)  # operations on an enum's member are slow, compared with a check of a socket
 
 
 class Event(Enum):
-    """An event of a connection, as ZeroMQ reports it."""
+    """An event of a connection."""
 
-    STOPPED = "the socket is closed: nothing is reported after it"
+    STOPPED = "the socket is closed: this is the last event"
     CONNECTED = "the handshake succeeded"
     DISCONNECTED = "a connection ended"
     DENIED = "the handshake failed: the key was denied (ZAP status 400)"
-    OTHER_MECHANISM = "the handshake failed: one side has keys, the other has none"
-    LEFT = "the other end closed the connection during the handshake"
+    OTHER_MECHANISM = "the handshake failed: only one side has keys"
+    LEFT = "the peer closed the connection during the handshake"
     FAILED = "the handshake failed for another reason"
 
 
@@ -43,15 +43,15 @@ _FAILURES = {
 class Monitor:
     """Receives the connection events of one socket.
 
-    libzmq's I/O thread blocks if a monitor is not read, or has no reader any more: so the queue has no limit, and a
-    socket that listens is drained until the event `STOPPED` before its monitor is closed.
+    libzmq's I/O thread blocks on a full queue or a closed reader. Therefore the queue has no limit, and the events of a
+    listening socket are read up to `STOPPED` before its monitor is closed.
     """
 
-    _numbers = itertools.count(1)  # a closed monitor keeps its address a little longer: each gets a new one
+    _numbers = itertools.count(1)  # of addresses: each monitor gets a new one, as closing releases it only later
 
     def __init__(self, socket: zmq.Socket[bytes]) -> None:
         address = f"inproc://events-{next(self._numbers)}"
-        self._events: zmq.Socket[bytes] = socket.context.socket(zmq.PAIR)  # first: nothing is reported without it
+        self._events: zmq.Socket[bytes] = socket.context.socket(zmq.PAIR)  # created first, so no event is lost
         self._events.set(zmq.RCVHWM, 0)
         try:
             socket.monitor(address, sum(_EVENTS))
@@ -61,9 +61,9 @@ class Monitor:
         self._events.connect(address)
 
     def events(self, seconds: float) -> Iterator[Event]:
-        """The events that are here, and those that come within so many seconds of the one before."""
+        """Yield events until no further one arrives within `seconds`."""
         while not self._events.closed and arrives(self._events, seconds):
-            report, _ = self._events.recv_multipart()  # and the address of the other end
+            report, _ = self._events.recv_multipart()  # the second part is the peer's address
             kind, value = struct.unpack("=Hi", report)
             event = _EVENTS[kind]
             yield _FAILURES.get(value, event) if event is Event.FAILED else event
@@ -73,7 +73,7 @@ class Monitor:
 
 
 def arrives(socket: zmq.Socket[bytes], seconds: float) -> bool:
-    """Return True if a socket has a message, or gets one within so many seconds."""
-    # To look costs half as much as `poll`, and most sockets that are looked at have no message.
+    """Return True if a socket has a message, or receives one within `seconds`."""
+    # Reading the option costs half as much as `poll`, and most sockets have no message.
     has_message = int(socket.get(zmq.EVENTS)) & _POLLIN != 0
     return has_message or (seconds > 0 and bool(socket.poll(round(seconds * 1000))))

@@ -4,11 +4,11 @@ The publisher binds an XPUB socket, subscribers connect SUB sockets. They subscr
 one kind of message, or to the messages of one kind about one object (the bytes that these messages begin with, see
 `catstream.wire.codec.opening`). The publisher never waits for a subscriber: a slow one misses messages.
 
-If a channel keeps the newest message, the newest of each object is sent to late joiners, and once per second to all
-subscribers, because a burst may have cost one of them the last messages. A `Subscriber` drops repeats. At most half as
-many messages as fit into the queue of a subscriber are repeated at once.
+If a channel keeps the newest message, the publisher sends the newest of each object to late joiners, and once per
+second to all subscribers, because a burst may have cost one of them the last messages. A `Subscriber` drops repeats.
+At once, at most half a subscriber's queue is repeated.
 
-The number of topics that a peer can make either side remember is limited.
+Both sides limit the number of topics that a peer can make them store.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ from catstream.wire.messages import End, Features, Health, Track
 from catstream.wire.monitor import arrives
 from catstream.wire.socket import ChannelSocket
 
-REPEAT_SECONDS = 1.0  #: after which the last messages are sent again
-_MOST_KEPT = 256  # newest messages that are kept, one of each object
-_MOST_TOPICS = 1024  # topics that a publisher knows the subscribers of, and that a subscriber knows the last message of
+REPEAT_SECONDS = 1.0  #: interval at which the last messages are sent again
+_MOST_STORED = 256  # newest messages that are stored, one of each object
+_MOST_TOPICS = 1024  # subscribed topics that a publisher stores, and last messages that a subscriber stores
 _MAX_CHANGES = 1000  # subscriptions that are processed at once
 _MAX_SUBSCRIPTION_BYTES = 4096
 
@@ -45,7 +45,7 @@ class Publisher(ChannelSocket[Message]):
         super().__init__(zmq.XPUB, channel, endpoint, channel.high_water_mark)
         self._socket.set(zmq.MAXMSGSIZE, _MAX_SUBSCRIPTION_BYTES)
         self._socket.set(zmq.XPUB_VERBOSE, 1)  # report every subscription, not only the first of a topic
-        self._kinds = tuple(map(opening, channel.messages))  # the beginnings of topics that may be subscribed to
+        self._kinds = tuple(map(opening, channel.messages))  # prefixes of valid topics
         self._subscribed: set[bytes] = set()
         self._last: dict[Topic, bytes] = {}  # the messages for late joiners, in the order of sending
         self._repeat_at = 0.0
@@ -53,7 +53,7 @@ class Publisher(ChannelSocket[Message]):
 
     @property
     def has_subscribers(self) -> bool:
-        """True if more than the end had a subscriber when `send` or `serve_late_joiners` was last called."""
+        """True if a message other than `End` had a subscriber at the last `send` or `serve_late_joiners`."""
         return not self._subscribed <= {_END}
 
     def send(self, message: Message) -> None:
@@ -63,11 +63,11 @@ class Publisher(ChannelSocket[Message]):
             return
         data = self._encode(message)
         if self._newest:
-            if isinstance(message, End):  # nothing before it counts
+            if isinstance(message, End):  # supersedes all messages before it
                 self._last.clear()
             self._last.pop(topic := topic_of(data), None)
             self._last[topic] = data
-            if len(self._last) > _MOST_KEPT:
+            if len(self._last) > _MOST_STORED:
                 del self._last[next(iter(self._last))]
             self._repeat_at = self._repeat_at or monotonic() + REPEAT_SECONDS
         self._socket.send(data, copy=False)
@@ -81,13 +81,13 @@ class Publisher(ChannelSocket[Message]):
         """Process subscriptions; send some of the last messages again if it is time. Call once per iteration."""
         self._read_events()
         joined = False
-        for _ in range(_MAX_CHANGES):  # the rest waits for the next call: a flood does not stop the process
+        for _ in range(_MAX_CHANGES):  # a flood must not block the process: the rest waits for the next call
             if not arrives(self._socket, 0):
                 break
             joined |= self._process(self._socket.recv())
         if not self._last or not (joined or monotonic() >= self._repeat_at):
             return
-        # As many of the last messages as half the queue of a subscriber holds; they are put at the back.
+        # Send as many as fill half of a subscriber's queue, and move them to the back.
         topics = list(self._last)[: max(1, self.channel.high_water_mark // 2)]
         for topic in topics:
             self._last[topic] = data = self._last.pop(topic)
@@ -105,7 +105,7 @@ class Publisher(ChannelSocket[Message]):
         elif subscribes:
             self._subscribed.add(topic)
             return True
-        else:  # its last subscriber has left
+        else:  # XPUB reports the end of a topic's last subscription
             self._subscribed.discard(topic)
         return False
 
@@ -113,9 +113,9 @@ class Publisher(ChannelSocket[Message]):
 class Subscriber(ChannelSocket[Message]):
     """Receives messages that are published from now on; if the channel keeps the newest message, the last ones first.
 
-    If the channel keeps the newest message, older ones of the same object are passed over. The objects take turns: the
-    message of the object that has waited longest is received first. `only` limits it to one kind of message, and
-    `about` to this kind of messages about one object. With `newest`, this holds for any channel.
+    If the channel keeps the newest message, or with `newest`, older messages of the same object are dropped; the object
+    that has waited longest is served first. `only` limits it to one kind of message, `about` to messages of this kind
+    about one object.
     """
 
     def __init__(
@@ -128,16 +128,16 @@ class Subscriber(ChannelSocket[Message]):
         newest: bool = False,
     ) -> None:
         self._newest = channel.keeps == "newest"
-        self._passes_over = (newest or self._newest) and len(channel.senders) == 1
+        self._conflates = (newest or self._newest) and len(channel.senders) == 1
         super().__init__(zmq.SUB, channel, endpoint, channel.high_water_mark)
-        self._socket.set(zmq.LINGER, 0)  # while a publisher is away, its subscriptions wait to be sent again
-        self._arrived: dict[Topic, bytes] = {}  # newest message of each topic, the topic that waits longest first
+        self._socket.set(zmq.LINGER, 0)  # do not wait at the exit to send subscriptions to a lost publisher
+        self._arrived: dict[Topic, bytes] = {}  # newest message of each topic, longest-waiting topic first
         self._last: dict[tuple[Topic, str], object] = {}  # identity of the last message of each object or process
         self._socket.subscribe(b"" if only is None else opening(only, about))
         self._connect()
 
     def pending(self) -> bool:
-        """Return True if something has arrived that was not received yet."""
+        """Return True if a message has arrived that was not received yet."""
         return bool(self._arrived) or super().pending()
 
     def receive(self, seconds: float) -> Message | None:
@@ -150,26 +150,26 @@ class Subscriber(ChannelSocket[Message]):
         return None
 
     def receive_all(self, seconds: float = 0.0) -> list[Message]:
-        """All messages that have arrived, oldest first; if none has, wait at most this long for one."""
+        """All messages that have arrived, oldest first; waits up to `seconds` for the first one."""
         first = self.receive(seconds)
         return [] if first is None else [first, *iter(lambda: self.receive(0), None)]
 
     def _next_data(self, deadline: float) -> bytes | None:
-        """The next message as it arrived, None if none arrives before the deadline.
+        """The next message as bytes, None if none arrives before the deadline.
 
         It is a copy: the destructor of a zmq.Frame handles signals, and Python ignores an exception raised there.
         """
-        if not self._passes_over:
+        if not self._conflates:
             return self._socket.recv() if self._wait(deadline - monotonic()) else None
-        while len(self._arrived) < _MOST_KEPT and self._wait(0 if self._arrived else deadline - monotonic()):
+        while len(self._arrived) < _MOST_STORED and self._wait(0 if self._arrived else deadline - monotonic()):
             data = self._socket.recv()
-            self._arrived[topic_of(data)] = data  # in the place of an older one
+            self._arrived[topic_of(data)] = data  # replaces an older one, and keeps its position in the queue
         return self._arrived.pop(next(iter(self._arrived))) if self._arrived else None
 
     def _is_repeat(self, message: Message, data: bytes) -> bool:
-        """Return True if a message is the last one of its object or process, which is sent again now and then.
+        """Return True if a message repeats the last one of its object or process.
 
-        It is identified by its version. A message without a version is small, and identified by all of its bytes.
+        Messages are identified by their version; those without a version are small, and identified by all bytes.
         """
         if not self._newest:
             return False
@@ -177,29 +177,29 @@ class Subscriber(ChannelSocket[Message]):
         source = Topic(type(message).__name__, about), self.run
         version = getattr(message, "version", None)
         identity = hash(data) if version is None else (version, getattr(message, "began", 0))
-        before = self._last.pop(source, None)
+        previous = self._last.pop(source, None)
         self._last[source] = identity
         if len(self._last) > _MOST_TOPICS:
             del self._last[next(iter(self._last))]
-        return before == identity
+        return previous == identity
 
 
 class GapCounter:
-    """Counts lost frames of a stream by the gaps in the numbers of the frames of its messages, which start with 0.
+    """Counts lost frames of a stream by the gaps in its frame numbers, which start with 0.
 
     The tracks of all objects in a frame have the same number. A restarted sender may repeat numbers.
 
     missed  frames without a message, between the first and the last received frame
-    before  frames before the first message that was received
+    before  frames before the first received message
     """
 
     def __init__(self, *, of_one_object: bool = False) -> None:
         self.missed = self.before = self._next = 0
         self._of_one_object = of_one_object
-        self._began: int | None = None  # frame in which the one object began: there were no messages before
+        self._began: int | None = None  # first frame of the one object: it has no messages before
 
     def take(self, message: Track | Features) -> None:
-        """Count the frames missing before the next message."""
+        """Count the missing frames before the next message."""
         if self._of_one_object and isinstance(message, Track) and message.began != self._began:
             self._began = message.began
             self._next = message.frame + 1
@@ -207,8 +207,8 @@ class GapCounter:
             self._count(message.frame)
 
     def end(self, end: End) -> None:
-        """Count the frames missing before the end; one object may have been forgotten before it."""
-        if not self._of_one_object:
+        """Count the missing frames before the end of the stream."""
+        if not self._of_one_object:  # one object may have been forgotten earlier
             self._count(end.frame)
 
     def _count(self, frame: int) -> None:

@@ -1,4 +1,4 @@
-"""How many messages and connections this process has rejected, for its health; each cause is logged once."""
+"""Counts the messages and connections that this process has rejected; each cause is logged once."""
 
 from __future__ import annotations
 
@@ -7,24 +7,24 @@ import threading
 
 from catstream.base.forks import after_fork
 
-_MOST_CAUSES = 1024  # that are remembered
+_MOST_CAUSES = 1024  # maximum size of `_logged`
 
 _log = logging.getLogger(__name__)
-_lock = threading.Lock()  # the ZAP handler has a thread of its own
+_lock = threading.Lock()  # the ZAP handler runs in its own thread
 _rejected = 0
 _logged: set[tuple[str, str]] = set()
 
 
-def _begin_copy() -> None:
+def _reset_after_fork() -> None:
     global _lock
-    _lock = threading.Lock()  # another thread of the original may have held it
+    _lock = threading.Lock()  # another thread of the parent may have locked it
 
 
-after_fork(_begin_copy)
+after_fork(_reset_after_fork)
 
 
 def reject(channel: str, cause: str, text: str) -> None:
-    """Count a message or a connection that was rejected on a channel, and log it unless its cause was logged before."""
+    """Count a rejected message or connection, and log it unless its cause was logged before."""
     global _rejected
     with _lock:
         _rejected += 1
@@ -37,5 +37,5 @@ def reject(channel: str, cause: str, text: str) -> None:
 
 
 def rejected() -> int:
-    """How many messages and connections this process has rejected."""
+    """The number of messages and connections that this process has rejected."""
     return _rejected

@@ -1,8 +1,8 @@
-"""The channel `results`: the tracks of each frame, for the program that owns the run.
+"""The channel `results`: the tracks of each frame, for the program that started the run (its owner).
 
-A PUSH socket connects to the PULL socket of the owner. Nothing is acknowledged: the owner has started the detector, and
-a detector that it starts again goes on after the last frame that the owner has. It drops the frames that it has. The
-sender's queue has no limit of its own: a detector is at most `run.unstored_frames` ahead of what its owner has read.
+The detector's PUSH socket connects to the owner's PULL socket. Messages are not acknowledged: the owner restarts a dead
+detector after the last received frame, and drops repeated frames. The sender's queue is unbounded, because a detector
+is at most `run.unstored_frames` ahead of the owner.
 """
 
 from __future__ import annotations
@@ -28,10 +28,7 @@ class ResultsSender(ChannelSocket[Tracks | End]):
 
 
 class ResultsReceiver(ChannelSocket[Tracks | End]):
-    """The owner's side: each frame once, in order; `last` is the number of the last message that the owner has.
-
-    At most `size` messages are queued.
-    """
+    """The owner's side: each frame once, in order, after message number `last`. It queues at most `size` messages."""
 
     def __init__(self, endpoint: Endpoint, size: int, last: int) -> None:
         super().__init__(zmq.PULL, RESULTS, endpoint, high_water_mark=size)
@@ -39,7 +36,7 @@ class ResultsReceiver(ChannelSocket[Tracks | End]):
         self._bind()
 
     def receive(self, seconds: float) -> Tracks | End | None:
-        """The next message that is new, None if none arrived in time."""
+        """The next new message, None after `seconds` or for a repeat."""
         if not self._wait(seconds):
             return None
         message = self._decode(self._socket.recv(), *self.channel.messages)

@@ -1,7 +1,7 @@
 """The schema of messages: the allowed values of each field, by its annotation.
 
-`catstream.wire.messages` states it. msgspec checks the types here where bytes become a message; `check_message` checks
-the arrays, which msgspec does not know. The tables of `docs/protocol.md` and the fuzzers are derived from the
+`catstream.wire.messages` contains the annotations. msgspec checks the types when bytes are decoded; `check_message`
+checks the arrays, which msgspec does not support. The tables of `docs/protocol.md` and the fuzzers are derived from the
 same annotations, by `fields`.
 """
 
@@ -23,7 +23,7 @@ from catstream.base.arrays import is_finite
 from catstream.base.names import PATTERN
 from catstream.errors import ProtocolError
 
-#: The length that each letter of a shape stands for, in one message.
+#: Length of each letter in the shapes of one message.
 _Lengths = dict[str, int]
 
 _TYPES = {name: np.dtype(name) for name in ("float32", "float64")}
@@ -31,15 +31,15 @@ _TYPES = {name: np.dtype(name) for name in ("float32", "float64")}
 Value = TypeVar("Value")
 Limit = TypeVar("Limit")
 
-LARGEST_INTEGER = 2**53  # so that a reader in any language holds it exactly
+LARGEST_INTEGER = 2**53  # exact in a double, for readers in any language
 LONGEST_LIST = 256  # entries of a list or map: levels of a tree, counters
-LONGEST_TEXT = 16384  # characters: 64 names of objects in a sentence
+LONGEST_TEXT = 16384  # characters: an error may list 64 names of objects
 
 Integer = Annotated[int, Meta(ge=0, le=LARGEST_INTEGER)]
 Number = Annotated[float, Meta(ge=-sys.float_info.max, le=sys.float_info.max)]  # also excludes NaN
 Text = Annotated[str, Meta(max_length=LONGEST_TEXT)]
 ObjectName = Annotated[str, Meta(pattern=rf"\A{PATTERN}\Z")]
-#: A map of something by the name of an object, and by any text.
+#: Maps by the name of an object, and by any text.
 ByObject = Annotated[dict[ObjectName, Value], Meta(max_length=LONGEST_LIST)]
 ByText = Annotated[dict[Text, Value], Meta(max_length=LONGEST_LIST)]
 
@@ -48,10 +48,10 @@ ByText = Annotated[dict[Text, Value], Meta(max_length=LONGEST_LIST)]
 class Array:
     """Limits of an array.
 
-    shape       lengths of its sides; a letter stands for the same length in all arrays of one message
-    low, high   its numbers are from `low` to `high`
-    above       its numbers are larger than this
-    may_be_nan  whether numbers may be other than finite, because NaN has a meaning
+    shape       lengths of its axes; a letter means the same length in all arrays of one message
+    low, high   inclusive range of its numbers
+    above       exclusive lower limit of its numbers
+    may_be_nan  whether numbers need not be finite, because NaN has a meaning
     """
 
     dtype: Literal["float32", "float64"]
@@ -62,7 +62,7 @@ class Array:
     may_be_nan: bool = False
 
     def range(self) -> str:
-        """The range of its numbers in words, empty if there is none."""
+        """Description of the range of its numbers, empty without limits."""
         between = f" from {self.low:g} to {self.high:g}" if math.isfinite(self.low) else ""
         return between + (f" above {self.above:g}" if math.isfinite(self.above) else "")
 
@@ -71,8 +71,8 @@ class Array:
 class Named:
     """Limits of a map of arrays, or of messages with rows.
 
-    columns   the names that it may have, each with its columns beyond d: with them, d is the same for all
-    required  the names that it always has
+    columns   allowed names, and how many columns more than d the rows of each have; d is the same for all
+    required  names that must be present
     """
 
     columns: Mapping[str, int]
@@ -81,15 +81,15 @@ class Named:
 
 @dataclass(frozen=True, slots=True)
 class Field:
-    """A field of a message, as its annotation states it.
+    """A field of a message, parsed from its annotation.
 
-    type          without None, and without metadata
+    type          type without None and metadata
     optional      whether None is allowed
     array, named  limits of an array, and of a map
     meta          limits that msgspec checks
-    is_message    whether its values are messages themselves
-    has_arrays    whether it is an array, or holds some
-    keys, values  of a map: what its names and its values are
+    is_message    whether its values are messages
+    has_arrays    whether it is or contains an array
+    keys, values  fields for the keys and values of a map
     """
 
     name: str
@@ -145,9 +145,9 @@ def _first(limits: tuple[object, ...], kind: type[Limit]) -> Limit | None:
 
 
 def check_message(message: object) -> _Lengths:
-    """Check the arrays of a message, and of the messages in it: dtypes, shapes, numbers and names.
+    """Check the arrays of a message and of its nested messages: dtypes, shapes, numbers and names.
 
-    Returns the length that each letter in their shapes stands for; ProtocolError if an array breaks its schema.
+    Returns the length of each letter in their shapes; ProtocolError if an array violates its schema.
     """
     lengths: _Lengths = {}
     kind: type = type(message)
@@ -158,7 +158,7 @@ def check_message(message: object) -> _Lengths:
 
 
 def _check(field: Field, value: Any, lengths: _Lengths, where: str) -> _Lengths | None:
-    """Check a value of a field; returns the lengths of a message of its own."""
+    """Check a value of a field; returns the lengths of a nested message."""
     if value is None:
         return None
     if field.values is not None:
@@ -173,9 +173,9 @@ def _check(field: Field, value: Any, lengths: _Lengths, where: str) -> _Lengths 
 
 
 def _check_names(lengths_of: dict[str, _Lengths | None], named: Named, where: str) -> None:
-    """Check the names of a map, and that its messages have rows of d columns, each with those that its name adds.
+    """Check the names of a map, and that the rows of its messages have the same d without their additional columns.
 
-    The lengths of an array are None: it shares the lengths of the enclosing message.
+    Arrays have no lengths of their own (None): they share those of the enclosing message.
     """
     if not named.required <= lengths_of.keys() <= named.columns.keys():
         expected = ", ".join(f"{name} (always)" if name in named.required else name for name in named.columns)
@@ -195,7 +195,7 @@ def _check_array(array: np.ndarray, limits: Array, lengths: _Lengths, where: str
             f"{where}: expected {limits.dtype} ({letters}), got {array.dtype} {array.shape} with {lengths}"
         )
     if not limits.may_be_nan and not is_finite(array):
-        raise ProtocolError(f"{where}: holds numbers that are not finite")
+        raise ProtocolError(f"{where}: expected finite numbers, got NaN or infinity")
     if array.size and (limits.low, limits.above) != (-math.inf, -math.inf):
         least, most = float(array.min()), float(array.max())
         if not (limits.low <= least and most <= limits.high and least > limits.above):

@@ -1,8 +1,8 @@
-"""The sockets of all channels: context, limits, keys, and the check of messages.
+"""The base class of the sockets of all channels: context, limits, keys, and validation of messages.
 
-Every queue, message and handshake has a limit. A frame that is not a message of the channel is counted, logged once and
-dropped. If the endpoint has keys, everything is encrypted (CURVE), and a peer that connects needs a key with the role
-of the channel: `catstream.wire.zap` decides.
+Every queue, message and handshake has a limit. An invalid frame is counted, logged once and dropped. If the endpoint
+has keys, all traffic is encrypted (CURVE), and a connecting peer needs a key with the role of the channel, which
+`catstream.wire.zap` checks.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import Any, Generic, Self, TypeVar
 from weakref import WeakSet
 
 import zmq
-import zmq.utils.garbage  # with the first message that is not copied, zmq would import it
+import zmq.utils.garbage  # now, rather than with the first zero-copy message
 
 from catstream.base.forks import after_fork, check_not_forked, forked, generation
 from catstream.errors import ProtocolError, ServiceError
@@ -27,15 +27,15 @@ from catstream.wire.monitor import Event, Monitor, arrives
 from catstream.wire.rejects import reject
 from catstream.wire.zap import ZapHandler
 
-LINGER_SECONDS = 2.0  #: that a closed socket still has to transmit its last messages
-RECONNECT_MOST_SECONDS = 0.5  #: between two attempts to connect again
-KEEPALIVE_SECONDS = 5  #: without traffic, after which TCP probes the other host
-KEEPALIVE_PROBE_SECONDS = 2  #: between two probes
-KEEPALIVE_PROBES = 3  #: without an answer, after which the connection is closed
+LINGER_SECONDS = 2.0  #: time for a closed socket to transmit its last messages
+RECONNECT_MOST_SECONDS = 0.5  #: maximum interval between two attempts to reconnect
+KEEPALIVE_SECONDS = 5  #: time without traffic after which TCP probes the other host
+KEEPALIVE_PROBE_SECONDS = 2  #: interval between two probes
+KEEPALIVE_PROBES = 3  #: unanswered probes after which the connection is closed
 
-#: No ZeroMQ heartbeats: libzmq aborts the process if one is due to a peer that disconnected while its queue was full
-#: (libzmq issue 4767). On one machine the kernel reports that a peer has ended. If a host loses its power, TCP
-#: keepalive reports it after 11 s, or once the host is up again.
+#: No ZeroMQ heartbeats: libzmq aborts the process when it sends one to a peer that disconnected with a full queue
+#: (libzmq issue 4767). On one machine, the kernel reports that a peer has ended. If another host loses its power, TCP
+#: keepalive detects it after 11 s, or once the host is up again.
 _OPTIONS = {
     zmq.LINGER: round(LINGER_SECONDS * 1000),
     zmq.HANDSHAKE_IVL: 5000,
@@ -43,7 +43,7 @@ _OPTIONS = {
     zmq.TCP_KEEPALIVE_IDLE: KEEPALIVE_SECONDS,
     zmq.TCP_KEEPALIVE_INTVL: KEEPALIVE_PROBE_SECONDS,
     zmq.TCP_KEEPALIVE_CNT: KEEPALIVE_PROBES,
-    zmq.RECONNECT_IVL: 20,  # before the first attempt to connect again; doubled each time
+    zmq.RECONNECT_IVL: 20,  # before the first attempt to reconnect; doubled each time
     zmq.RECONNECT_IVL_MAX: round(RECONNECT_MOST_SECONDS * 1000),
 }
 
@@ -56,13 +56,13 @@ _ZAP = ZapHandler()  # ZAP handlers are per context
 
 @cache
 def context() -> zmq.Context[zmq.Socket[bytes]]:
-    """The ZeroMQ context of catstream in this process; only the limit of open files limits its number of sockets."""
+    """The ZeroMQ context of catstream in this process; its sockets are limited only by the limit of open files."""
     context = zmq.Context()
     context.set(zmq.MAX_SOCKETS, context.get(zmq.SOCKET_LIMIT))
     return context
 
 
-def _begin_copy() -> None:
+def _reset_after_fork() -> None:
     """Drop the ZeroMQ context and threads inherited through fork."""
     global _ZAP
     context.cache_clear()
@@ -70,13 +70,13 @@ def _begin_copy() -> None:
     _ZAP = ZapHandler()
 
 
-after_fork(_begin_copy)
+after_fork(_reset_after_fork)
 
 
 def _too_many(error: zmq.ZMQError) -> ServiceError:
-    """The error for a socket that ZeroMQ could not make: each socket and its monitor need files."""
+    """The error for a socket that ZeroMQ could not create: each socket and its monitor use file descriptors."""
     return ServiceError(
-        f"cannot open a socket ({error.strerror}): close the subscriptions and pipelines that are not needed, "
+        f"cannot open a socket ({error.strerror}): close unneeded subscriptions and pipelines, "
         "or raise the limit of open files (ulimit -n)"
     )
 
@@ -90,21 +90,18 @@ _REMEDIES = {
 
 
 @atexit.register
-def _transmit_rest() -> None:
-    """Wait until ZeroMQ's thread has transmitted what closed sockets have queued: its memory is freed at the exit."""
+def _flush() -> None:
+    """Wait until ZeroMQ's thread has transmitted the queues of closed sockets, before their memory is freed."""
     if not _OPEN:
         context().term()
 
 
 class ChannelSocket(Generic[Message]):
-    """One ZeroMQ socket of a channel, of one of ZeroMQ's kinds; it queues `high_water_mark` messages for each peer.
-
-    run  id of the run that the last message is from, see `catstream.wire.codec`; empty if it is not known
-    """
+    """One ZeroMQ socket of a channel; `kind` is ZeroMQ's. It queues `high_water_mark` messages for each peer."""
 
     def __init__(self, kind: int, channel: Channel[Message], endpoint: Endpoint, high_water_mark: int) -> None:
         self.channel = channel
-        self.run = ""
+        self.run = ""  #: id of the run of the last message, see `catstream.wire.codec`; empty if unknown
         self._endpoint = endpoint
         self._listens = False
         self._domain = b""  # name of this socket for ZAP, if it listens and there are keys
@@ -123,7 +120,7 @@ class ChannelSocket(Generic[Message]):
         self._socket.set(zmq.MAXMSGSIZE, channel.limit)
 
     def fileno(self) -> int:
-        """Readable if something may have arrived since this socket was last asked for a message."""
+        """File descriptor that becomes readable if a message may have arrived since the last `receive`."""
         return int(self._socket.get(zmq.FD))
 
     def close(self) -> None:
@@ -132,8 +129,8 @@ class ChannelSocket(Generic[Message]):
             return
         if self._listens:
             self._socket.close()
-            # libzmq stops listening some time later, and would remove the socket file of the next one with its own.
-            # Unbinding first would be faster, but drops queued messages.
+            # libzmq stops listening asynchronously, and would then remove the socket file of a successor. Unbinding
+            # first would be faster, but drops queued messages.
             self._read_events(2 * LINGER_SECONDS, until=Event.STOPPED)
             self._listens = False
         elif not self._socket.closed:
@@ -147,15 +144,15 @@ class ChannelSocket(Generic[Message]):
         _OPEN.discard(self)
 
     def __del__(self) -> None:
-        # The monitor of a socket that was dropped has no reader any more, and would block ZeroMQ's thread: nothing more
-        # would arrive at any socket of this program.
+        # The monitor of a garbage-collected socket has no reader, and would block ZeroMQ's thread: no socket of this
+        # program would receive anything.
         socket = getattr(self, "_socket", None)
         if socket is not None and not socket.closed and not forked(self._generation):
             socket.disable_monitor()
             socket.close()
             if self._monitor is not None:
                 self._monitor.close()
-            warnings.warn("a subscription or control was not closed: use it in a `with`", ResourceWarning, stacklevel=1)
+            warnings.warn("unclosed subscription or control: use it in a `with`", ResourceWarning, stacklevel=1)
 
     def __enter__(self) -> Self:
         return self
@@ -201,18 +198,18 @@ class ChannelSocket(Generic[Message]):
             self._socket.connect(self._endpoint.address(self.channel, sender))
 
     def pending(self) -> bool:
-        """Return True if something has arrived that was not received yet."""
+        """Return True if a message has arrived that was not received yet."""
         return self._wait(0)
 
     def _wait(self, seconds: float) -> bool:
-        """Return True if something arrives within so many seconds; handles the events of connections first."""
+        """Handle connection events; return True if a message arrives within `seconds`."""
         self._read_events()
         return arrives(self._socket, seconds)
 
     def _decode(
         self, data: bytes | memoryview, *kinds: type[Kind], check: Callable[[Kind], None] | None = None
     ) -> Kind | None:
-        """The message in `data`, None if it is rejected."""
+        """Decode a message; None if it is rejected."""
         try:
             message, self.run = decode_with_run(data, *kinds)
             if check is not None:
@@ -223,15 +220,15 @@ class ChannelSocket(Generic[Message]):
         return message
 
     def _encode(self, message: object) -> bytes:
-        """A message of this process as bytes."""
+        """Encode a message of this process."""
         return encode(message, self._endpoint.run)
 
     def _receive_from_peer(self) -> tuple[bytes, memoryview | None]:
-        """Peer and data of a ROUTER's next message; the data is None if the message has not exactly one part."""
+        """Peer and data of a ROUTER's next message; the data is None unless the message has exactly one part."""
         peer = self._socket.recv()
         data = self._socket.recv(copy=False).buffer
         parts = 1
-        while self._socket.get(zmq.RCVMORE):  # one by one: a peer may send any number
+        while self._socket.get(zmq.RCVMORE):  # one by one: the number of parts has no limit
             self._socket.recv(copy=False)
             parts += 1
         if parts > 1:
@@ -240,13 +237,13 @@ class ChannelSocket(Generic[Message]):
         return peer, data
 
     def _reject(self, cause: str, text: str) -> None:
-        """Count a message that is not what the channel carries, and log it once for each cause."""
+        """Count an invalid message, and log it once for each cause."""
         reject(self.channel.name, cause, text)
 
     def _read_events(self, seconds: float = 0.0, until: Event | None = None) -> None:
-        """Handle what was reported about connections; wait so long for each event, until a certain one.
+        """Handle connection events; wait up to `seconds` for each, until the event `until`.
 
-        ServiceError if this side connects and is denied, or in a copy of the process.
+        ServiceError if this side connects and is denied, or in a forked process.
         """
         check_not_forked(self._generation)
         for event in self._monitor.events(seconds) if self._monitor is not None else ():
@@ -260,25 +257,25 @@ class ChannelSocket(Generic[Message]):
                 break
 
     def _connected(self) -> None:
-        """A connection began."""
+        """Handle a new connection."""
 
     def _disconnected(self) -> None:
-        """A connection ended."""
+        """Handle the end of a connection."""
 
     def _handshake_failed(self, event: Event) -> None:
-        """Count a peer that failed, unless the ZAP handler has counted it; as a client, raise an error if denied.
+        """Count a failed handshake, unless the ZAP handler has counted it; as a client, raise an error if denied.
 
-        Without keys, a peer that left is not counted. With keys, it may be one without keys, which detects that first.
+        A peer that left is counted only with keys: a peer without keys detects the mismatch first and leaves.
         """
         endpoint, keys = self._endpoint, self._endpoint.keys
         if self._listens:
             if event is not (Event.LEFT if keys is None else Event.DENIED):
                 why = "does not speak ZeroMQ, or has keys" if keys is None else "has left, or lacks the pipeline's keys"
-                reject(self.channel.name, "handshake", f"a peer has failed the handshake: it {why}")
+                reject(self.channel.name, "handshake", f"the handshake with a peer failed: it {why}")
         elif event is Event.DENIED:
             raise ServiceError(
                 f"{endpoint} rejects the key in {keys and keys.folder}: it is not allowed, or lacks the role "
-                f"{self.channel.role}, which {self.channel.name} requires; ask its administrator (catstream keys allow)"
+                f"{self.channel.role}, which {self.channel.name} requires; ask the administrator (catstream keys allow)"
             )
         elif event is Event.OTHER_MECHANISM:
             raise ServiceError(

@@ -15,10 +15,10 @@ from catstream.wire.rejects import reject
 
 
 class ZapHandler:
-    """Decides which peers may connect to the listening sockets of this process, if the pipeline has keys.
+    """Authorises peers at the listening sockets of this process, if the pipeline has keys.
 
-    libzmq asks once for each connection, before it reads a message of it, by its protocol ZAP (RFC 27). A question
-    names the socket, as a "domain", and the peer's public key; the peer has already proved that it has the secret one.
+    libzmq sends one request for each connection (ZAP, RFC 27) before it reads a message. It contains the socket's
+    "domain", and the public key of the peer, which has already proved that it has the secret key.
     A thread answers while a socket is registered. See decision 23 in docs/decisions.md.
     """
 
@@ -59,10 +59,10 @@ class ZapHandler:
                 _, request, domain, address, _, mechanism, *credentials = question
                 status = self._status(domain, address.decode(errors="replace"), mechanism, credentials)
                 socket.send_multipart([b"1.0", request, status, b"", b"", b""])
-            socket.unbind(self._address)  # at once, for the next thread: libzmq closes some time later
+            socket.unbind(self._address)  # closing is asynchronous, and the next thread needs the address
 
     def _status(self, domain: bytes, address: str, mechanism: bytes, credentials: list[bytes]) -> bytes:
-        """The status that lets a peer connect (200), try again later (300), or not (400)."""
+        """The ZAP status of a peer: allowed (200), temporary error (300), or denied (400)."""
         if domain not in self._sockets or mechanism != b"CURVE":
             return b"400"
         channel, keys = self._sockets[domain]
@@ -70,7 +70,7 @@ class ZapHandler:
         try:
             allowed = [(name, client.role) for name, client in clients(keys.folder).items() if client.public == public]
         except ServiceError as error:
-            reject(channel.name, str(error), f"no client can connect: {error}")
+            reject(channel.name, str(error), f"clients cannot connect: {error}")
             return b"300"
         reason = f"its key {public} is not allowed"
         for name, role in allowed:

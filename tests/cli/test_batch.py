@@ -162,7 +162,7 @@ def test_logs_of_a_batch_become_one_data_set(demo, succeed, fail, demo_video, tm
     labels = sorted((tmp_path / "set" / "labels").iterdir())
     assert [file.stem.rpartition("_")[0] for file in labels] == ["cam"] * FRAMES + ["two_cam"] * FRAMES
     assert {file.read_text()[0] for file in labels[FRAMES:]} == {"1"}
-    assert "the logs are of several sources" in fail("export", tmp_path / "out", tmp_path / "all.xml")
+    assert "the logs have different sources" in fail("export", tmp_path / "out", tmp_path / "all.xml")
     assert "contains no .ndjson file" in fail("export", tmp_path / "two", tmp_path / "set2", "--format", "yolo")
 
 

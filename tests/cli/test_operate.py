@@ -85,7 +85,7 @@ def test_command_names_the_only_pipeline_that_it_selects(said, fail, commanded):
 def test_endpoint_without_a_pipeline_is_an_error(fail, tmp_path, words, error):
     line = fail(*words, "--endpoint", tmp_path, cwd=tmp_path)
     assert line.startswith(f"catstream: {error.format(tmp_path)}: is a pipeline running there?")
-    assert "It has no sockets: if it runs, they were removed; start it again." in line
+    assert "The folder has no sockets; if it runs, they were removed: restart it." in line
     assert not list(tmp_path.iterdir())
 
 

@@ -51,7 +51,7 @@ def test_live_run_continues_after_faults_until_ctrl_c(camera, catstream, said, t
     assert sum(max(box.overlap(truth) for _, truth in frames) > 0.6 for box in boxes) > 0.8 * len(rows)
 
 
-REJECTED = {"omit lockstep": ["--lockstep"], "has no start, end or stride": ["--start=9"], "connection refused": []}
+REJECTED = {"needs a file": ["--lockstep"], "has no start, end or stride": ["--start=9"], "connection refused": []}
 
 
 @pytest.mark.parametrize(("words", "options"), REJECTED.items(), ids=REJECTED)

@@ -110,7 +110,7 @@ def ray(monkeypatch):
     facts = {"NodeManagerAddress": "127.0.0.1", "Resources": {"CPU": 2.0}, "Alive": True}
     fake.nodes = [facts | {"NodeName": f"n{number}", "NodeID": str(number)} for number in (1, 2)]
     monkeypatch.setattr(module, "nodes", lambda: list(fake.nodes))
-    monkeypatch.setattr(module, "_TURN_SECONDS", 1e6)  # a test calls it
+    monkeypatch.setattr(module, "_RECONCILE_SECONDS", 1e6)  # a test calls it
     monkeypatch.setattr(module, "die_with", lambda _: None)
     return fake
 
@@ -141,13 +141,13 @@ def made(ray, spec, monkeypatch, folder):  # noqa: ARG001  the module finds it a
 def site(made, spec):
     site = made()
     site.apply(spec, {})
-    site._turn()
+    site._reconcile()
     return site
 
 
 def running(site, ray, name, node="1", state="running", **facts):
     ray.of(name).status = StreamStatus(name, state, node, **facts)
-    site._turn()  # asks, and takes the answer
+    site._reconcile()  # asks, and takes the answer
 
 
 def states(site):
@@ -169,7 +169,7 @@ def test_restarted_controller_leaves_running_streams_alone(site, ray, made, spec
     actors = dict(ray.actors)
     ray.has_restarted = True
     again = made()
-    again._turn()
+    again._reconcile()
     assert (ray.actors, ray.started) == (actors, ["gate", "roof"])
     assert again.apply(spec, {}) == ["gate: is unchanged", "roof: is unchanged"]
     assert states(again) == {"gate": "running", "roof": "starting"}
@@ -193,13 +193,13 @@ def test_ended_stream_is_started_again_only_if_it_is_changed(site, ray):
     began = time.monotonic()
     running(site, ray, "gate", state="ended", frame=31, stored_seconds=2.0)
     for _ in range(3):
-        site._turn()
+        site._reconcile()
     assert (states(site)["gate"], ray.started.count("gate")) == ("ended", 1)
     assert 2.0 <= site.status().streams["gate"].stored_seconds <= 2.0 + time.monotonic() - began
     assert site.add(GATE, {}) == ["gate: has ended", "roof: is unchanged"]
     site.add(replace(GATE, source="demo:3"), {})
     for _ in range(2):
-        site._turn()
+        site._reconcile()
     assert (states(site)["gate"], ray.started.count("gate")) == ("starting", 2)
 
 
@@ -208,7 +208,7 @@ def test_superseded_actor_is_killed_and_replaced(site, ray):
     actor.superseded = True
     running(site, ray, "gate", state="failed")
     for _ in range(3):
-        site._turn()
+        site._reconcile()
     assert ray.of("gate") is not actor
 
 
@@ -220,12 +220,12 @@ def test_removed_and_forgotten_stream_leaves_nothing(site, ray, spec):
     assert site.remove(("gate",)) == ["gate: is removed", "roof: is unchanged"]
     store.stream("gate").clear()
     for _ in range(4):
-        site._turn()
+        site._reconcile()
     assert store.stream("gate").newest() is None
     assert list(from_json(store.fleet.newest().files["fleet"]).streams) == ["roof"]
     assert "gate" not in site._actors
     site.add(GATE, {})
-    site._turn()
+    site._reconcile()
     assert ray.of("gate").options["scheduling_strategy"] == "SPREAD"
 
 
@@ -299,16 +299,16 @@ def test_pending_or_silent_stream_is_reported_before_its_restart(made, spec, ray
     monkeypatch.setattr(time, "monotonic", lambda: now)
     site = made()
     site.apply(spec, {})
-    site._turn()
+    site._reconcile()
     running(site, ray, "gate")
     assert [each.trouble for each in site.status().streams.values()] == ["", ""]
     ray.of("gate").status = None  # its machine is cut off
-    site._turn()
+    site._reconcile()
     now += 50
-    site._turn()
+    site._reconcile()
     gate, roof = site.status().streams.values()
     assert (gate.state, gate.node, gate.trouble) == ("running", "n1", "it has not answered for 50 s")
-    unplaced = "Ray has not started it for 50 s: `ray status` says what it needs"
+    unplaced = "Ray has not started it for 50 s: see its demands in `ray status`"
     assert (roof.state, roof.trouble) == ("starting", unplaced)
 
 
@@ -316,21 +316,21 @@ def test_hanging_actor_is_restarted_and_killed_if_it_does_not_stop(site, ray, mo
     running(site, ray, "gate")
     gate, roof = ray.of("gate"), ray.of("roof")
     gate.status = None
-    site._turn()
+    site._reconcile()
     later = time.monotonic() + module.SILENT_SECONDS + 1
     monkeypatch.setattr(time, "monotonic", lambda: later)
-    site._turn()
+    site._reconcile()
     assert (gate.restarted, roof.restarted) == (1, 0), "Ray waits for a node for the roof"
     site._actors["gate"].call = Call(error=RayError("killed"))
-    site._turn()
+    site._reconcile()
     running(site, ray, "gate")
     gate.unstored = None  # it does not answer
     site.remove(("gate",))
-    site._turn()
+    site._reconcile()
     assert gate.asked[-1] == ("stop",)
     later += module.STOPPING_SECONDS + 1
     for _ in range(3):
-        site._turn()
+        site._reconcile()
     assert "gate" not in site._actors
 
 
@@ -340,11 +340,11 @@ def test_streams_are_stopped_before_the_fleet_ends(site, ray):
     gate = ray.of("gate")
     gate.unstored = "the store is full"
     assert site.close() == ["gate", "roof"]
-    site._turn()
+    site._reconcile()
     assert states(site) == {"gate": "stopping", "roof": "stopping"}
     assert gate.asked[-1] == ("stop",)
     for _ in range(3):
-        site._turn()
+        site._reconcile()
     assert (site.close(), ray.actors) == ([], {})
     assert states(site) == {"gate": "stopping", "roof": "stopping"}
     assert site.end() == ["gate: the store is full"]
@@ -353,11 +353,11 @@ def test_streams_are_stopped_before_the_fleet_ends(site, ray):
 def test_controller_of_an_ended_fleet_runs_nothing_before_up(site, ray, made, spec):
     for _ in range(4):
         site.close()
-        site._turn()
+        site._reconcile()
     again = made()
-    again._turn()
+    again._reconcile()
     assert ray.actors == {}
     lines = again.apply(replace(spec, streams={"gate": GATE, "lake": StreamSpec("lake", "demo:3")}), {})
     assert lines == ["gate: continues from its last state", "lake: is added", "roof: is removed"]
-    again._turn()
+    again._reconcile()
     assert sorted(ray.started[-2:]) == ["gate", "lake"]

@@ -107,7 +107,7 @@ def test_digest_changes_if_the_stream_must_restart(change, restarts):
     [
         ('[streams.cam-7]\nsource="0"\n[streams.cam-7]\nsource="1"', "this is not TOML: Cannot declare ('streams', "),
         ("", "missing streams: add a table for each, for example [streams.cam-1]"),
-        ("[stream.cam-1]\nsource='0'", "there is no key 'stream', did you mean 'streams'?"),
+        ("[stream.cam-1]\nsource='0'", "unknown key 'stream', did you mean 'streams'?"),
         ("[streams]\ncam-7 = 3", "the stream cam-7: expected a table with a source, got 3: write [streams.cam-7]"),
         ('[streams."cam 7"]\nsource="0"', "'cam 7' is not a valid name of a stream: expected 1 to 64 letters"),
     ],
@@ -123,13 +123,13 @@ def test_error_of_the_file_is_one_line(load, lines, error, tmp_path):
     ("line", "error"),
     [
         ("", "missing source: add one as for `catstream track`, for example source ="),
-        ("sorce = '0'", "there is no key 'sorce', did you mean 'source'? there are source, box"),
+        ("sorce = '0'", "unknown key 'sorce', did you mean 'source'? expected source, box"),
         ("source = '0'\nbox = [1, 2, 3]", "a box is four numbers x,y,w,h in pixels, got [1, 2, 3]"),
         ("source = '0'\nbox = [1, 2, 30, 0]", "the box of the object without a name: a box needs a width and a height"),
         ("source = '0'\nbox = [1, 2, 3, 4]\nboxes = {}", "box and boxes are mutually exclusive: write all"),
         ("source = '0'\ncores = 0", "cores must be a number above 0, got"),
         ("source = '0'\nwrite = 'a.csv'", "write must be destinations, for example ["),
-        ("source = '0'\nwrite = ['-']", "write: there is no standard output: pass a file or an address"),
+        ("source = '0'\nwrite = ['-']", "write: a fleet has no standard output: pass a file or an address"),
     ],
 )
 def test_error_of_a_stream_names_it_and_is_one_line(load, line, error):

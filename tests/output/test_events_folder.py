@@ -82,7 +82,7 @@ def test_oldest_pictures_are_removed_and_other_files_stay(tmp_path, endpoint, un
 
 def test_folder_that_cannot_be_made_is_an_error_before_the_run(tmp_path):
     (tmp_path / "file").touch()
-    with pytest.raises(VideoError, match=r"cannot make the folder .*: Not a directory"):
+    with pytest.raises(VideoError, match=r"cannot create the folder .*: Not a directory"):
         check_sink(f"{tmp_path}/file/events/", SinkOptions())
 
 

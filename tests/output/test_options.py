@@ -30,7 +30,7 @@ def test_file_and_command_line_give_the_same_options():
         ({"zone": {"door": "1,2 3,four 5,6"}}, "zone: expected the corners of door as X,Y X,Y X,Y ..., got"),
         ({"zone": {"door": ""}}, "zone: zone door: a polygon has at least 3 corners, got 0"),
         ({"zone": {"it's": "1,2 9,4 5,9"}}, "zone: zone: .* is not a name"),
-        ({"rotate": "1 week"}, "rotate: expected a time or a size, as 12h, 1d, 500MB or 2GB, got '1 week'"),
+        ({"rotate": "1 week"}, "rotate: expected a time or a size such as 12h, 1d, 500MB or 2GB, got '1 week'"),
         ({"when": "gone"}, "when: expected some of found, lost, returned"),
         ({"when": "found=3"}, "when: expected some of found, lost, returned"),
         ({"when": "lost=soon"}, "when: expected 0 to 86400 seconds, as in lost=10, got 'lost=soon'"),

@@ -314,7 +314,7 @@ def test_damaged_line_is_an_error_with_its_number_or_skipped(tmp_path, name, dam
     lines = log.read_bytes().splitlines(keepends=True)
     log.write_bytes(b"".join([*lines[:5], damage, *lines[5:]]))
     for read in (lambda: list(Log(log)), RunFiles(Origin(), None, [str(log)]).position):
-        with pytest.raises(VideoError, match=rf"{name}, line 6 is no track .*--skip-damaged"):
+        with pytest.raises(VideoError, match=rf"{name}, line 6 is not a track .*--skip-damaged"):
             read()
     skipping = Log(log, skip_damaged=True)
     assert [frame.number for frame in skipping] == list(range(9))

@@ -95,7 +95,7 @@ with catstream.Pipeline(sys.argv[1], sys.argv[2]) as pipeline, catstream.subscri
             use = tracks = pipeline = None
             gc.collect()
             os._exit(7)
-    complete = {'job.safetensors', 'owner', 'endpoint', 'results'} <= {*os.listdir(pipeline.endpoint)}
+    complete = {'job.safetensors', 'lock', 'endpoint', 'results'} <= {*os.listdir(pipeline.endpoint)}
     print(*codes, complete, 1 + len([*tracks]), pipeline.totals["restarts"])
 """
 

@@ -23,7 +23,7 @@ def looks(endpoint, previews, until):
 
     def begin():
         reader = subscribe(str(endpoint), "previews", timeout=500)
-        until(lambda: previews.has_subscribers, previews.turn)
+        until(lambda: previews.has_subscribers, previews.serve)
         return reader
 
     return begin
@@ -53,7 +53,7 @@ def test_previews_continue_while_no_object_is_tracked(previews, looks, monkeypat
         for grey in (0, 255):
             previews.show(3, Frame(grey, 0.4, np.full((48, 64, 3), grey, np.uint8)), {})
             now[0] += 0.06  # the second one is due 0.1 s after the first
-            previews.turn()
+            previews.serve()
             jpeg = np.frombuffer(next(reader).jpeg, np.uint8)
             assert np.median(cv2.imdecode(jpeg, cv2.IMREAD_GRAYSCALE)) == grey
 
@@ -62,7 +62,7 @@ def test_frames_are_stored_for_five_seconds_for_subscribers(endpoint, until, mon
     monkeypatch.setattr("catstream.processes.outputs._PREVIEW_SECONDS", 0.0)
     with Previews(endpoint, stores=True) as previews:
         with subscribe(str(endpoint), "previews", timeout=500):
-            until(lambda: previews.has_subscribers, previews.turn)
+            until(lambda: previews.has_subscribers, previews.serve)
             for number in range(80):
                 previews.show(3, Frame(number, number / 10, np.zeros((48, 64, 3), np.uint8)), {})
             assert [frame.number for frame in previews.since(3.0)] == list(range(30, 80))
@@ -70,4 +70,4 @@ def test_frames_are_stored_for_five_seconds_for_subscribers(endpoint, until, mon
             monkeypatch.setattr("catstream.processes.outputs._STORED_BYTES", 3 * 48 * 64 * 3)
             previews.show(3, Frame(80, 8.0, np.zeros((48, 64, 3), np.uint8)), {})
             assert [frame.number for frame in previews.since(7.8)] == [78, 79, 80]
-        until(lambda: not previews.since(7.8), previews.turn)
+        until(lambda: not previews.since(7.8), previews.serve)

@@ -11,7 +11,7 @@ from catstream.detection.objects import Detectors
 from catstream.errors import CatstreamError, ObjectError, SettingsError
 from catstream.processes.control_commands import check_room, continues, execute, object_of
 from catstream.processes.decisions import DesiredObject, DesiredState
-from catstream.wire.messages import LARGEST_GIVEN_MODEL, Command, DetectorState, Model
+from catstream.wire.messages import LARGEST_INITIAL_MODEL, Command, DetectorState, Model
 
 BOX, PLACE = Box(40, 30, 20, 20), Window(40, 30, 20, 20)
 SAVED = DesiredObject(BOX, 1, "digest", 1000, 5)
@@ -77,7 +77,7 @@ def test_search_replaces_its_object_from_the_next_frame_on(tracked):
         (("a", "b", "c", "d"), "e", SAVED, ObjectError),
         (("a", "b"), "", SAVED, ObjectError),
         (("a",), "", None, ObjectError),
-        (("a",), "b", replace(SAVED, size=LARGEST_GIVEN_MODEL + 1), SettingsError),
+        (("a",), "b", replace(SAVED, size=LARGEST_INITIAL_MODEL + 1), SettingsError),
     ],
     ids=["too many", "which one", "no model", "too large"],
 )
@@ -104,7 +104,7 @@ def test_command_for_an_unknown_object_is_an_error(tracked, verb, names, name):
 
 @pytest.mark.parametrize(
     ("name", "done", "reason"),
-    [("anna", True, "model 4 after"), ("ben", False, "nothing was learned"), ("carl", False, "was not found yet")],
+    [("anna", True, "model 4 after"), ("ben", False, "has no model yet"), ("carl", False, "not detected yet")],
 )
 def test_object_without_a_model_or_detection_is_not_saved(tracked, name, done, reason):
     before = desired("anna", "ben", "carl")

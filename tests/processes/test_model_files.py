@@ -46,7 +46,7 @@ def test_damaged_or_removed_model_is_missing(learned, tmp_path, caplog):
     files.keep_only(set())
     assert list(tmp_path.iterdir()) == []
     assert files.get(name) is None
-    assert "is not searched for any more" in caplog.text
+    assert "search for the object of a saved model was stopped" in caplog.text
 
 
 @pytest.mark.parametrize("has_state", [True, False])

@@ -23,13 +23,13 @@ def process(folder, monkeypatch):
 def test_detector_waits_for_its_program(process):
     waits = []
 
-    def turn():
+    def poll():
         """The program reads one frame."""
-        waits.append(process.owner.read)
-        process.owner.read += 1
+        waits.append(process.consumer.read)
+        process.consumer.read += 1
 
     owner = ResultsReceiver(replace(process.endpoint, run=""), 5, 0)
-    with owner, Outputs(process, turn, lambda *_: None) as outputs:
+    with owner, Outputs(process, poll, lambda *_: None) as outputs:
         outputs._send_features = lambda _: None  # the compressor has room
         for seq in range(1, 8):
             outputs.send(Tracks(seq - 1, {}), Features(seq - 1, 0.0, {}))

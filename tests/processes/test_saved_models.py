@@ -26,7 +26,7 @@ def compressor(name, rng, frames=6):
 def received(publisher, compressors, reader, after_each=lambda: None):
     """The first message that a subscriber receives."""
     for _ in range(200):
-        publisher.turn(compressors, after_each)
+        publisher.serve(compressors, after_each)
         if (message := reader.receive(0.05)) is not None:
             return message
     raise AssertionError("nothing was received")
@@ -46,7 +46,7 @@ def test_no_file_is_made_without_a_subscriber(endpoint, rng, monkeypatch):
     monkeypatch.setattr(SavedModel, "of", lambda *_: pytest.fail("a file was made"))
     with SavedModels(endpoint, SETTINGS) as publisher:
         for _ in range(3):
-            publisher.turn({"": compressor("", rng)}, Mock())
+            publisher.serve({"": compressor("", rng)}, Mock())
 
 
 def test_later_subscriber_receives_the_newest_trees(endpoint, rng):
@@ -55,8 +55,8 @@ def test_later_subscriber_receives_the_newest_trees(endpoint, rng):
         with Subscriber(SAVED_MODELS, endpoint) as reader:
             first = received(publisher, compressors, reader)
         while publisher.has_subscribers:
-            publisher.turn(compressors, Mock())
+            publisher.serve(compressors, Mock())
         compressors[""] = compressor("", rng, frames=30)
-        publisher.turn(compressors, Mock())
+        publisher.serve(compressors, Mock())
         with Subscriber(SAVED_MODELS, endpoint) as reader:
             assert received(publisher, compressors, reader).version == compressors[""].version > first.version

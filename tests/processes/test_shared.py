@@ -10,9 +10,9 @@ def test_watchdog_allows_announced_long_steps():
         watchdog = memory.watchdog
         assert watchdog.patience == LONG_SECONDS, "a start takes long"
         loop = SharedMemory(memory.handle).watchdog
-        before = watchdog.turns
+        before = watchdog.iterations
         loop.beat()
-        assert (watchdog.turns, watchdog.patience) == (before + 1, RUNNING_SECONDS)
+        assert (watchdog.iterations, watchdog.patience) == (before + 1, RUNNING_SECONDS)
         loop.allow(300)
         assert watchdog.patience == 300
         loop.limit += 6  # each turn skips frames of the source

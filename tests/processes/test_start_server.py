@@ -41,7 +41,7 @@ def start(folder, tmp_path, until):
         log, memory = ProcessLog("trainer", (tmp_path / f"{len(started)}.log").open("w+b")), SharedMemory()
         process = start_server().start("trainer", file, log.fileno(), memory.handle, restarted=False)
         started.append((process, memory, log))
-        until(lambda: job or memory.watchdog.turns > 2)
+        until(lambda: job or memory.watchdog.iterations > 2)
         return started[-1]
 
     yield trainer
@@ -107,7 +107,7 @@ from catstream.processes.shared import SharedMemory
 with open({str(log)!r}, "w+b") as log:
     memory = SharedMemory()
     process = start_server().start("trainer", Path({str(job)!r}), log.fileno(), memory.handle, restarted=False)
-    while memory.watchdog.turns < 3 and process.poll() is None:
+    while memory.watchdog.iterations < 3 and process.poll() is None:
         time.sleep(0.01)
     code = process.poll()
     process.close()
@@ -127,7 +127,7 @@ def test_process_begins_with_no_blocked_signal_and_most_files(start, until):
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, mask)
         resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
-    until(lambda: memory.watchdog.turns > 2)
+    until(lambda: memory.watchdog.iterations > 2)
     assert psutil.Process(process.pid).rlimit(psutil.RLIMIT_NOFILE) == (hard, hard)
     process.send_signal(signal.SIGTERM)
     assert until(process.poll) == 4

@@ -19,7 +19,7 @@ from catstream.features.pyramid import Pyramid
 from catstream.video import rendered
 from catstream.wire.channels import CHANNELS
 from catstream.wire.codec import KINDS, VERSION, decode, encode
-from catstream.wire.messages import LARGEST_GIVEN_MODELS, Features, Health, ObjectFeatures, Sample, Track, TrainingRows
+from catstream.wire.messages import LARGEST_INITIAL_MODELS, Features, Health, ObjectFeatures, Sample, Track, TrainingRows
 from catstream.wire.schema import LONGEST_LIST, LONGEST_TEXT
 from tests.wire.examples import example
 
@@ -92,7 +92,7 @@ def test_features_of_the_most_objects_fit_into_their_channel():
     detectors, ((image, box),) = Detectors(Settings()), rendered.render(1, (320, 240))
     pyramid = Pyramid(image)
     _, features = detectors.step(pyramid, results={"": detectors.begin("", pyramid, box)})
-    largest = get_args(describe()["run.max_objects"].type)[1].le * len(encode(features)) + LARGEST_GIVEN_MODELS
+    largest = get_args(describe()["run.max_objects"].type)[1].le * len(encode(features)) + LARGEST_INITIAL_MODELS
     assert largest < CHANNELS["all-features"].limit == CHANNELS["features"].limit
 
 

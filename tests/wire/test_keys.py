@@ -109,8 +109,8 @@ def test_keys_are_not_overwritten_and_names_are_no_paths(keys):
         create(keys)
     for name, output, error in [
         ("other", "watcher", "not overwritten"),
-        ("operator", "new", "a client operator already"),
-        *((name, "new", "a client's name") for name in ("", ".", "../keys", "a/b", ".hidden", "a b", "x" * 65)),
+        ("operator", "new", "a client operator exists"),
+        *((name, "new", "a client name") for name in ("", ".", "../keys", "a/b", ".hidden", "a b", "x" * 65)),
     ]:
         with pytest.raises(ServiceError, match=error):
             allow(keys, name, "control", output=keys.parent / output)
@@ -119,7 +119,7 @@ def test_keys_are_not_overwritten_and_names_are_no_paths(keys):
 
 
 def test_keys_that_are_readable_or_of_a_client_are_rejected(keys, place):
-    with pytest.raises(ServiceError, match="a pipeline needs the folder that `catstream keys new` made"):
+    with pytest.raises(ServiceError, match="made by `catstream keys new`"):
         Publisher(TRACKS, place("watcher"))
     known = Keys.load(keys)
     assert known.secret.decode() not in repr(known)

@@ -88,7 +88,7 @@ def test_ipv6_loopback_is_an_endpoint(until):
 def test_sockets_without_close_do_not_block_the_io_thread(endpoint):
     with Publisher(TRACKS, endpoint):
         dropped = [Subscriber(TRACKS, endpoint) for _ in range(10)]
-        with pytest.warns(ResourceWarning, match="not closed"):
+        with pytest.warns(ResourceWarning, match="unclosed"):
             dropped.clear()
     other = context().socket(zmq.PUB)
     events = Monitor(other)

@@ -57,7 +57,7 @@ def test_damaged_or_incomplete_file_is_refused(damage):
     for place, byte in damage:
         content[int(place * len(content))] = byte
     message = (
-        r"trees is not an undamaged file of catstream \((.|\n)*\): use an older copy, or a file that catstream wrote"
+        r"trees is damaged or not a file of catstream \((.|\n)*\): use an older copy, or a file that catstream wrote"
     )
     assert re.fullmatch(f"({message})?", refusal(bytes(content)))
     assert re.fullmatch(message, refusal(WHOLE[: int(damage[0][0] * len(WHOLE))]))

@@ -9,9 +9,9 @@ import pytest
 from catstream.base.box import Box
 from catstream.detection.objects import Detectors
 from catstream.features.pyramid import Pyramid
-from catstream.processes.beginnings import Beginnings
 from catstream.processes.commands import Commands
 from catstream.processes.decisions import DesiredObject, DesiredState, Start
+from catstream.processes.initialization import Initializer
 from catstream.processes.job import Job
 from catstream.processes.outputs import Previews
 from catstream.processes.process import Process
@@ -27,18 +27,18 @@ class Stream:
 
     def __init__(self, process, commands, detectors, previews, image):
         self.commands, self.detectors, self._image = commands, detectors, image
-        self.beginnings = Beginnings(process, detectors, commands, previews)
+        self.initializer = Initializer(process, detectors, commands, previews)
 
-    def frame(self, held=False):
-        """The names of the objects that begin in the next frame; it is tracked unless there are none while held."""
+    def frame(self, suspended=False):
+        """The names of the objects that begin in the next frame; tracked if any begins or not suspended."""
         number, answers = self.detectors.seq, []
         self.commands.store_and_answer = lambda *answered: answers.extend(answered)
-        beginnings = self.beginnings.in_frame(Frame(number, number / 25, self._image), held=held)
-        if beginnings or not held:
-            results = {one.name: one.result for one in beginnings}
+        objects = self.initializer.in_frame(Frame(number, number / 25, self._image), suspended=suspended)
+        if objects or not suspended:
+            results = {one.name: one.result for one in objects}
             self.detectors.step(Pyramid(self._image), number / 25, results)
         self.answers = [(answered.object, answered.done) for answered in answers]
-        return [one.name for one in beginnings]
+        return [one.name for one in objects]
 
 
 @pytest.fixture
@@ -60,9 +60,9 @@ def test_object_of_the_job_begins_in_the_first_frame_only(stream):
 
 
 def test_objects_begin_in_a_paused_run_only_with_a_box(stream):
-    assert stream.frame(held=True) == []
+    assert stream.frame(suspended=True) == []
     stream.commands.boxes.append(set_box("1", "ben"))
-    assert stream.frame(held=True) == ["ben", "anna"]
+    assert stream.frame(suspended=True) == ["ben", "anna"]
 
 
 def test_second_box_for_one_name_waits_for_the_next_frame(stream):
@@ -87,9 +87,9 @@ def test_pause_with_a_limit_ends_by_itself(stream, monkeypatch):
     now = [100.0]
     monkeypatch.setattr("catstream.processes.commands.monotonic", lambda: now[0])
     assert stream.commands._execute(Command("1", "pause", seconds=30.0)).done
-    assert stream.commands.hold
+    assert stream.commands.suspended
     now[0] += 31
-    assert not stream.commands.hold
+    assert not stream.commands.suspended
 
 
 def test_run_with_a_torn_state_resumes_with_its_first_boxes(folder, tmp_path, monkeypatch):
@@ -122,7 +122,7 @@ def test_resumed_object_without_a_state_begins_again(stream):
     objects = {"anna": DesiredObject(BOX, begins=8), "ben": DesiredObject(OTHER, begins=20)}
     start = Start(7, 7, DesiredState(objects), {})
     stream.detectors.seq = start.seq
-    stream.beginnings.resume(start, {})
+    stream.initializer.resume(start, {})
     stream.commands.resume(start)
     assert stream.frame() == ["anna", "ben"], "of ben nothing is there"
     assert stream.detectors.detectors["anna"].state.first_frame == 7
