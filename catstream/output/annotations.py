@@ -1,8 +1,8 @@
-"""Formats of annotation tools and data sets, made from a log: COCO, CVAT for video, YOLO and VIA tracks.
+"""Exports to annotation tools and data sets: COCO, CVAT for video, YOLO and VIA tracks.
 
-Frames have their numbers in the source. The image of a frame is NAME_000000.jpg, with the name of the log and the
-number of the frame; an image of a folder keeps its name, after NAME_ in a data set of several logs. A doubtful box is
-marked, except in YOLO, which has no field for it; CVAT also has `checked` of an annotation.
+Frames are numbered as in the source. The image of a frame is NAME_000000.jpg, with the name of the log and the frame
+number. An image of a folder keeps its name, prefixed with NAME_ in a data set of several logs. Doubtful boxes are
+marked, except in YOLO, which has no field for it; CVAT also has the field `checked` of an annotation.
 """
 
 from __future__ import annotations
@@ -54,15 +54,15 @@ class About:
     """The parameters of an export.
 
     name     name of the log, for the images
-    header   header of the log; an empty one if the log has none
+    header   header of the log; by default an empty one
     size     width and height of a frame in pixels; None if unknown
     frames   number of frames of the source; None if unknown
-    label    class of all objects; empty if the name of each is its class
+    label    class of all objects; if empty, the class of an object is its name
     classes  names of the classes in the order of their numbers; empty for the order of the log
-    images   files of the images of the source; empty if it is a video
-    prefix   of the names of these images, since several logs may use the same names
-    source   path of the source whose images are written; empty to write none
-    is_first whether this is the first log of a data set: the labels of an earlier one are removed
+    images   files of the images of the source; empty for a video
+    prefix   prefix for the names of these images, because several logs may use the same names
+    source   path of the source whose images are written; empty to write no images
+    is_first whether this is the first log of a data set, for which existing labels are removed
     """
 
     name: str
@@ -77,8 +77,8 @@ class About:
     is_first: bool = True
 
 
-class _Place(NamedTuple):
-    """A box of an object. Objects are numbered from 1; an object that reuses a name has a number of its own."""
+class _Item(NamedTuple):
+    """A box of an object. Objects are numbered from 1; a new object that reuses a name has a new number."""
 
     number: int
     label: str
@@ -87,16 +87,16 @@ class _Place(NamedTuple):
 
 
 def write_coco(frames: Iterable[TrackedFrame], path: Path, about: About) -> None:
-    """Write the objects of COCO, with the fields that TAO adds for videos and tracks; ids count from 1."""
+    """Write COCO, with TAO's fields for videos and tracks; ids count from 1."""
     classes = _numbers(frames, about, first=1)
     images: list[dict[str, Any]] = []
     tracks: dict[int, dict[str, Any]] = {}
     boxes: list[dict[str, Any]] = []
     size = _size(about)
-    for frame, places in _places(frames, about):
+    for frame, items in _items(frames, about):
         image = {"id": frame + 1, "file_name": _image(about, frame), **size}
         images.append(image | {"video_id": 1, "frame_index": frame})
-        for number, label, track, box in places:
+        for number, label, track, box in items:
             of = {"category_id": classes[label], "video_id": 1}
             tracks[number] = {"id": number, "name": track.object, **of}
             ids = {"id": len(boxes) + 1, "image_id": image["id"], "track_id": number, **of}
@@ -116,31 +116,33 @@ def write_coco(frames: Iterable[TrackedFrame], path: Path, about: About) -> None
 def write_cvat(frames: Iterable[TrackedFrame], path: Path, about: About) -> str:
     """Write `CVAT for video 1.1`: a keyframe for each box, and an outside keyframe where the object disappears.
 
-    CVAT drops boxes that are not keyframes, and interpolates. So the attribute `checked` marks the boxes that a person
-    drew in an annotation.
+    CVAT drops boxes that are not keyframes, and interpolates. The attribute `checked` therefore marks the boxes that a
+    person drew in an annotation.
 
-    CVAT refuses a file with a frame that its video does not have, so a track that reaches the last frame of the source
-    has no such end. If `about.frames` is None, this is the last frame of the log; returns a line that says so.
+    CVAT rejects frames beyond the end of its video, so a track up to the last frame has no outside keyframe. If
+    `about.frames` is None, the last frame of the log is assumed to be the last one; returns a note about it.
     """
-    objects: dict[int, list[_Place]] = {}
+    # Step 1: the boxes of each object, and the number of frames.
+    objects: dict[int, list[_Item]] = {}
     end, step = 0, about.header.stride
-    for frame, places in _places(frames, about):
+    for frame, items in _items(frames, about):
         end = frame + 1
-        for place in places:
-            objects.setdefault(place.number, []).append(place)
+        for item in items:
+            objects.setdefault(item.number, []).append(item)
     note = "" if about.frames else "the video was not read: its last frame is assumed to be the last tracked one"
     end = about.frames or end
-    checked = any(place.track.checked for places in objects.values() for place in places)
+    # Step 2: write a track for each object, with an outside keyframe before each gap.
+    checked = any(item.track.checked for items in objects.values() for item in items)
     kinds = (_CVAT_LABEL.format(escape(name), _CVAT_CHECKED if checked else "") for name in _numbers(frames, about))
     with path.open("w", encoding="utf-8") as file:
         file.write(_CVAT_HEAD.format(name=escape(about.name), frames=end, labels="\n".join(kinds), **_size(about)))
-        for number, places in objects.items():
-            file.write(f'<track id="{number - 1}" label="{escape(places[0].label)}" source="auto">\n')
-            following = [*(place.track.source_frame for place in places[1:]), end]
-            for place, after in zip(places, following, strict=True):
-                frame, (x, y, w, h) = place.track.source_frame, place.box
-                check = f'<attribute name="checked">{place.track.checked}</attribute>' if checked else ""
-                rest = x, y, x + w, y + h, str(place.track.doubtful).lower(), check
+        for number, items in objects.items():
+            file.write(f'<track id="{number - 1}" label="{escape(items[0].label)}" source="auto">\n')
+            following = [*(item.track.source_frame for item in items[1:]), end]
+            for item, after in zip(items, following, strict=True):
+                frame, (x, y, w, h) = item.track.source_frame, item.box
+                check = f'<attribute name="checked">{item.track.checked}</attribute>' if checked else ""
+                rest = x, y, x + w, y + h, str(item.track.doubtful).lower(), check
                 file.write(_CVAT_BOX.format(frame, False, *rest))
                 if frame + step < after:
                     file.write(_CVAT_BOX.format(frame + step, True, *rest))
@@ -150,21 +152,21 @@ def write_cvat(frames: Iterable[TrackedFrame], path: Path, about: About) -> str:
 
 
 def write_yolo(frames: Iterable[TrackedFrame], folder: Path, about: About) -> None:
-    """Write the labels of a YOLO data set, `class x y w h` of the centre in parts of the frame, and its data.yaml.
+    """Write the labels of a YOLO data set, `class x y w h` with the centre relative to the frame, and its data.yaml.
 
-    There is a file for each frame, which is empty if there is no box.
+    Each frame has a file, which is empty without boxes.
     """
     classes, labels = _numbers(frames, about), folder / "labels"
     labels.mkdir(parents=True, exist_ok=True)
-    (folder / "labels.cache").unlink(missing_ok=True)  # Ultralytics takes it for the cache of other labels of this size
+    (folder / "labels.cache").unlink(missing_ok=True)  # Ultralytics would use it for new labels of the same total size
     for file in labels.glob("*.txt") if about.is_first else ():
         file.unlink()
     names = "".join(f"  {number}: {json.dumps(name, ensure_ascii=False)}\n" for name, number in classes.items())
     (folder / "data.yaml").write_text(f"train: images\nval: images\nnames:\n{names}", encoding="utf-8")
     width, height = _size(about).values()
-    for frame, places in _places(frames, about):
+    for frame, items in _items(frames, about):
         lines = []
-        for _, label, _, box in places:
+        for _, label, _, box in items:
             x, y = box.centre
             sides = x / width, y / height, box.w / width, box.h / height
             lines.append(f"{classes[label]} {' '.join(f'{side:.6f}' for side in sides)}\n")
@@ -174,7 +176,7 @@ def write_yolo(frames: Iterable[TrackedFrame], folder: Path, about: About) -> No
 
 
 def _write_images(frames: Iterable[TrackedFrame], folder: Path, about: About) -> None:
-    """Write the images of the tracked frames: copies of the files of a folder, otherwise JPEG. Existing files stay."""
+    """Write the images of the tracked frames: copies of the files of a folder, or JPEG. Existing files are kept."""
     numbers = {frame.tracks[0].source_frame for frame in frames}
     folder.mkdir(exist_ok=True)
     missing = {number for number in numbers if not (folder / _image(about, number)).exists()}
@@ -188,12 +190,12 @@ def _write_images(frames: Iterable[TrackedFrame], folder: Path, about: About) ->
 
 
 def write_via(frames: Iterable[TrackedFrame], path: Path, about: About) -> None:
-    """Write the tracks of the VGG Image Annotator, one row for each box, as movement and napari read them."""
+    """Write tracks for the VGG Image Annotator, movement and napari: one row for each box."""
     with path.open("w", encoding="utf-8", newline="") as file:
         rows = csv.writer(file)
         rows.writerow(_VIA_COLUMNS)
-        for frame, places in _places(frames, about):
-            for index, (number, label, track, (x, y, w, h)) in enumerate(places):
+        for frame, items in _items(frames, about):
+            for index, (number, label, track, (x, y, w, h)) in enumerate(items):
                 shape = {"name": "rect", "x": x, "y": y, "width": w, "height": h}
                 attributes = {
                     "track": number,
@@ -202,30 +204,30 @@ def write_via(frames: Iterable[TrackedFrame], path: Path, about: About) -> None:
                     "doubtful": int(track.doubtful),
                 }
                 cells = [json.dumps(fields, ensure_ascii=False) for fields in ({"frame": frame}, shape, attributes)]
-                rows.writerow([_image(about, frame), -1, cells[0], len(places), index, *cells[1:]])
+                rows.writerow([_image(about, frame), -1, cells[0], len(items), index, *cells[1:]])
 
 
-def _places(frames: Iterable[TrackedFrame], about: About) -> Iterator[tuple[int, list[_Place]]]:
-    """Yield each frame's number in the source and its boxes, cut at the edges of the frame if its size is known."""
+def _items(frames: Iterable[TrackedFrame], about: About) -> Iterator[tuple[int, list[_Item]]]:
+    """Yield each frame's number in the source and its boxes, clipped to the frame if its size is known."""
     numbers: dict[tuple[str, int], int] = {}
     for frame in frames:
-        places = []
+        items = []
         for track in frame.tracks:
             number = numbers.setdefault((track.object, track.began), len(numbers) + 1)
-            if (box := _cut(track.box, about.size)) is not None:
-                places.append(_Place(number, _label(track, about.label), track, box))
-        yield frame.tracks[0].source_frame, places
+            if (box := _clip(track.box, about.size)) is not None:
+                items.append(_Item(number, _label(track, about.label), track, box))
+        yield frame.tracks[0].source_frame, items
 
 
 def _numbers(frames: Iterable[TrackedFrame], about: About, *, first: int = 0) -> dict[str, int]:
-    """Return the number of each class, in the order of `about.classes`, or else of the log.
+    """Return the number of each class, in the order of `about.classes` or, without them, of the log.
 
-    An object that is never present has a class. Raises VideoError if `about.classes` lacks one.
+    Objects that are never present have a class as well. Raises VideoError if `about.classes` lacks a class.
     """
-    found = classes_of(frames, about.label)
-    if about.classes and (lacking := [name for name in found if name not in about.classes]):
-        raise VideoError(f"--classes lacks {lacking[0]!r}: add it, or give all objects one class with --label")
-    return {name: number for number, name in enumerate(about.classes or found, first)}
+    classes = classes_of(frames, about.label)
+    if about.classes and (missing := [name for name in classes if name not in about.classes]):
+        raise VideoError(f"--classes lacks {missing[0]!r}: add it, or give all objects one class with --label")
+    return {name: number for number, name in enumerate(about.classes or classes, first)}
 
 
 def classes_of(frames: Iterable[TrackedFrame], label: str) -> list[str]:
@@ -237,8 +239,8 @@ def _label(track: Track, label: str) -> str:
     return label or track.object or "object"
 
 
-def _cut(box: Box | None, size: tuple[int, int] | None) -> Box | None:
-    """Return the part of a box that is in the frame; None if there is none."""
+def _clip(box: Box | None, size: tuple[int, int] | None) -> Box | None:
+    """Clip a box to the frame; None if it is outside."""
     if box is None or size is None:
         return box
     x, y = max(box.x, 0.0), max(box.y, 0.0)
@@ -247,7 +249,7 @@ def _cut(box: Box | None, size: tuple[int, int] | None) -> Box | None:
 
 
 def _size(about: About) -> dict[str, int]:
-    width, height = about.size or (0, 0)  # the formats that need it are not made without it
+    width, height = about.size or (0, 0)  # `export` requires the size for formats that use it
     return {"width": width, "height": height}
 
 

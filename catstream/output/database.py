@@ -1,4 +1,4 @@
-"""The table `tracks` of an SQLite database, which is read while a run adds to it, and its columns."""
+"""The table `tracks` of an SQLite database, which may be read while a run writes it."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from catstream.output.destinations import Header, Origin, Sink, TrackedFrame
 from catstream.output.remote import CLOSE_SECONDS, Warnings
 from catstream.wire.messages import Track
 
-#: Column -> its type in SQLite. `seconds` is the time since the start of the source, `pts` the time stamp in a live
-#: stream; a box is in pixels, and NULL if the object is absent; `object` is '' for an object without a name. But for an
+#: SQLite types by column. `seconds` is the time since the start of the source, `pts` the time stamp in a live stream. A
+#: box is in pixels, and NULL if the object is absent; `object` is '' for an object without a name. Except in an
 #: annotation, `checked` is '' and `probability` NULL.
 COLUMNS = {
     **{"frame": "INTEGER NOT NULL", "seconds": "REAL NOT NULL", "state": "TEXT NOT NULL"},
@@ -35,10 +35,10 @@ _TYPES = ", ".join(f"{name} {kind}" for name, kind in COLUMNS.items())
 _CREATE = f"CREATE TABLE IF NOT EXISTS tracks ({_TYPES}, PRIMARY KEY (frame, object)) STRICT"
 _INSERT = f"INSERT OR REPLACE INTO tracks ({_NAMES}) VALUES ({', '.join('?' for _ in COLUMNS)})"
 
-#: Frames that wait for a locked database at most.
+#: Maximum number of frames that wait for a locked database.
 _MOST_WAITING = 1 << 16
 
-#: The error of the system for errors of SQLite.
+#: Errors of the system by errors of SQLite.
 _ERRNO = {sqlite3.SQLITE_FULL: errno.ENOSPC, sqlite3.SQLITE_READONLY: errno.EROFS, sqlite3.SQLITE_IOERR: errno.EIO}
 
 
@@ -47,11 +47,11 @@ class _LockedError(VideoError):
 
 
 class SqliteSink(Sink):
-    """A table with the tracks of each frame at once; written rows remain if this process crashes.
+    """Writes each frame in one transaction; written rows survive a crash of this process.
 
-    An existing file is replaced, unless it is a log that is continued. While another program locks the database, frames
-    wait in memory, `_MOST_WAITING` at most; the oldest ones beyond that are missed. If the file is removed or renamed,
-    that is logged, and a new one continues.
+    An existing file is replaced, unless it is a log that is continued. While another program locks the database, up to
+    `_MOST_WAITING` frames wait in memory; the oldest are dropped. If the file is removed or renamed, a warning is
+    logged, and a new file continues.
     """
 
     def __init__(self, dest: str, origin: Origin) -> None:
@@ -72,7 +72,7 @@ class SqliteSink(Sink):
             raise
 
     def write(self, frame: TrackedFrame) -> None:
-        """Add the rows of a frame, all or none, after those that wait."""
+        """Add the rows of a frame after the waiting frames, in one transaction."""
         self._waiting.append(frame)
         if len(self._waiting) > _MOST_WAITING:
             self._waiting.popleft()
@@ -85,8 +85,8 @@ class SqliteSink(Sink):
             self._flush(CLOSE_SECONDS)
             if lost := len(self._waiting) + self.missed:
                 raise VideoError(
-                    f"{self._dest} lacks {counted(lost, 'frame')}, as another program locked it: if the run has an "
-                    "NDJSON log, catstream export makes it again"
+                    f"{self._dest} lacks {counted(lost, 'frame')}, because another program locked it: if the run has "
+                    "an NDJSON log, catstream export makes it again"
                 )
         finally:
             with _errors(self._dest), self._lock:
@@ -94,7 +94,7 @@ class SqliteSink(Sink):
                     self._database.close()
 
     def _flush(self, seconds: float = 0.0) -> None:
-        """Write the frames that wait; a locked database is tried for some seconds."""
+        """Write the waiting frames; if the database is locked, retry for some seconds."""
         try:
             with _errors(self._dest):
                 self._follow()
@@ -122,11 +122,11 @@ class SqliteSink(Sink):
         return database
 
     def _follow(self) -> None:
-        """Open a new file if another program has removed or renamed the file."""
+        """Open a new file if another program has removed or renamed the old one."""
         path = Path(self._dest)
         if path.exists() and os.path.samestat(path.stat(), os.fstat(self._lock.fileno())):
             return
-        self._warnings.log("removed or renamed by another program; the log goes on there without the rows before")
+        self._warnings.log("removed or renamed by another program; the log continues without the earlier rows")
         if self._database is not None:
             self._database.close()
         self._database = None
@@ -135,7 +135,7 @@ class SqliteSink(Sink):
 
 
 def create(database: sqlite3.Connection, header: Header) -> None:
-    """Create the tables of a log that has none yet."""
+    """Create the tables of a log, unless they exist."""
     database.execute(_CREATE)
     if not database.execute("SELECT 1 FROM sqlite_master WHERE name = 'header'").fetchone():
         database.execute("CREATE TABLE header (json TEXT NOT NULL) STRICT")
@@ -150,11 +150,11 @@ def write_database(frames: Iterable[TrackedFrame], path: Path, header: Header) -
 
 
 def read_database(path: Path) -> Iterator[TrackedFrame]:
-    """Yield the frames of a database that may grow meanwhile, in their order; none if there is no file or no table."""
+    """Yield the frames of a database, which may be growing, in order; nothing without a file or table."""
     if not path.exists():
         return
     with _errors(path, "read"), closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=rw", uri=True)) as database:
-        if not database.execute("SELECT 1 FROM sqlite_master").fetchone():  # killed before it made the table
+        if not database.execute("SELECT 1 FROM sqlite_master").fetchone():  # killed before it created the table
             return
         rows = database.execute(f"SELECT {_NAMES} FROM tracks ORDER BY frame, rowid")  # nosec B608
         for _, tracks in groupby(map(_track, rows), lambda track: track.frame):
@@ -162,7 +162,7 @@ def read_database(path: Path) -> Iterator[TrackedFrame]:
 
 
 def read_database_header(path: Path) -> Header | None:
-    """The header of the log in a database; None if it has none."""
+    """The header of the log in a database; None without one."""
     with _errors(path, "read"), closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=rw", uri=True)) as database:
         if not database.execute("SELECT 1 FROM sqlite_master WHERE name = 'header'").fetchone():
             return None

@@ -1,8 +1,8 @@
-"""THE TABLE of destinations of tracks.
+"""The table of destinations of tracks.
 
-A sink takes each frame while the run goes on: `catstream track --write DEST`, `catstream sink DEST`. A new one is a row
-here, a class in a file of its own, and a line in docs/how-to/sinks.md. `catstream.output.exports` has the formats that
-are made from a log afterwards.
+A sink receives each frame during a run: `catstream track --write DEST`, `catstream sink DEST`. A new sink is a row
+here, a class in its own module, and a line in docs/how-to/sinks.md. The formats to which a log is converted afterwards
+are in `catstream.output.exports`.
 """
 
 from __future__ import annotations
@@ -30,17 +30,17 @@ from catstream.video.images import IMAGES
 from catstream.video.source import VIDEOS
 from catstream.wire.messages import Track
 
-#: Stands for standard output.
+#: The destination for standard output.
 STDOUT = "-"
 
-#: Version of the format of a log, in its header.
+#: Version of the format of a log.
 FORMAT = 1
 
 
 class TrackedFrame(NamedTuple):
-    """The tracks of a frame, at least one; a subscriber receives them one by one, and passes on one at a time.
+    """One or more tracks of a frame; a subscriber passes on each track separately.
 
-    seconds  processing time of the frame, NaN if it is not known
+    seconds  processing time of the frame, NaN if unknown
     """
 
     tracks: Sequence[Track]
@@ -53,11 +53,11 @@ class TrackedFrame(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Header:
-    """The first line of an NDJSON log, as JSON, and the table `header` of a database: the run that its tracks are of.
+    """The run of a log: its first line in NDJSON, or the table `header` in a database.
 
     catstream  version of the format of the log
-    frame      -1: a program that reads the number of the frame in each line reads the header before frame 0
-    source     path or address of the source, without a password; empty beside a running pipeline
+    frame      -1, for programs that read a frame number in each line
+    source     path or address of the source, without a password; empty if another program runs the pipeline
     size       width and height of a frame, pixels; None if unknown
     rate       frames per second of the source; None if unknown
     frames     number of frames that the run tracks; None if unknown, or if the source is live
@@ -66,7 +66,7 @@ class Header:
     version    version of the program
     settings   NAME=VALUE of each setting that differs from its default
     boxes      initial box of each object that the run started with, by name
-    gap        0; in a further header, the number of frames before it that could not be written, as the disk was full
+    gap        in a header within the log, number of missing frames before it, for example because the disk was full
     """
 
     catstream: int = FORMAT
@@ -104,7 +104,7 @@ class Header:
 
 
 class Rotation(NamedTuple):
-    """When a log is renamed and a new one begins: in a new period of these seconds in UTC, or above these bytes."""
+    """When a log is rotated: at the first frame of a new period (in UTC), or above a size."""
 
     seconds: float
     bytes: float
@@ -116,12 +116,12 @@ class SinkOptions:
 
     zone         corners of each zone, a polygon in pixels of the frame, by name
     when         kinds of events that are sent, see `catstream.output.events.WHEN`
-    rate         messages per second about each object, at most, between its events
+    rate         maximum number of states of each object per second
     picture      whether each event has the newest picture of the pipeline
-    secret_file  file of the key that signs events; None to sign nothing
-    megabytes    limit of the size of a folder
-    rotate       when the logs of a live source are renamed; None for never
-    keep         number of renamed logs that remain, 0 for all
+    secret_file  file of the key that signs events; None for no signatures
+    megabytes    maximum size of a folder
+    rotate       when the logs of a live source are rotated; None for never
+    keep         maximum number of rotated logs, 0 for no limit
     """
 
     zone: dict[str, tuple[Point, ...]] = field(default_factory=dict)
@@ -138,13 +138,13 @@ class SinkOptions:
 class Origin:
     """The run whose tracks a sink writes.
 
-    header    of its log
-    address   of the running pipeline, for a sink that also receives pictures
-    options   of the destinations
-    attached  whether another program runs the pipeline: its source is not read a second time
-    last      last frame of the file if it is a log that is continued; None for a new file
+    header    header of its log
+    address   address of the running pipeline, for a sink that also receives pictures
+    options   options of the destinations
+    attached  whether another program runs the pipeline, so its source cannot be read a second time
+    last      last frame of a log that is continued; None for a new file
     size      number of bytes up to the end of that frame
-    gap       frames that could not be written because the sink could not be opened
+    gap       number of frames that were missed while the sink could not be opened
     """
 
     header: Header = field(default_factory=Header)
@@ -157,44 +157,44 @@ class Origin:
 
 
 class Sink(ABC):
-    """Writes the frames in their order; created as `Class(dest, origin)`.
+    """Writes frames in their order; created as `Class(dest, origin)`.
 
-    Its class may have a function `check(dest, options)`, which raises VideoError before the run if the address or an
-    option is not valid.
+    The class may have a function `check(dest, options)`, which raises VideoError before the run if the address or an
+    option is invalid.
 
-    missed  frames or messages that were dropped, as the destination was locked, slow or away
+    missed  number of frames or messages that were dropped because the destination was locked, slow or unreachable
     """
 
     missed = 0
 
     @abstractmethod
     def write(self, frame: TrackedFrame) -> None:
-        """Add a frame; raise VideoError if that is not possible."""
+        """Add a frame; raise VideoError if this fails."""
 
     def idle(self) -> object:  # noqa: B027  # optional
-        """Continue without a frame; called every few seconds while none arrives."""
+        """Do periodic work; called every few seconds while no frame arrives."""
 
     def end(self) -> object:  # noqa: B027
-        """Send the last events, without waiting until they have arrived; called before any sink is closed."""
+        """Send the last events without waiting for their delivery; called before any sink is closed."""
 
     @abstractmethod
     def close(self) -> None:
-        """Complete the output; raise VideoError if that is not possible."""
+        """Complete the output; raise VideoError if this fails."""
 
 
 class Row(NamedTuple):
-    """A row of the table: the class of a sink, as module.Class, and a line of the help."""
+    """A row of the table: the class or function of a sink, as module.Name, and a line of the help."""
 
-    home: str
+    target: str
     meaning: str
 
     def load(self) -> Any:
-        """Import the class."""
-        module, _, name = self.home.rpartition(".")
+        """Import the class or function."""
+        module, _, name = self.target.rpartition(".")
         return getattr(import_module(f"catstream.output.{module}"), name)
 
 
-#: The suffix of a file, the scheme of an address such as "mqtt://", "/" for a folder, or "-" -> the sink.
+#: Sinks by the suffix of a file, the scheme of an address such as "mqtt://", "/" for a folder, or "-".
 SINKS = {
     ".ndjson": Row("track_log.NdjsonSink", "the log: one JSON object per line, after a header"),
     STDOUT: Row("track_log.StdoutSink", "the same, without the header, on standard output"),
@@ -210,7 +210,7 @@ SINKS = {
 
 
 def kind_of(dest: str) -> str:
-    """Return the key of a destination in `SINKS`, or what would be its key.
+    """Return the key for `SINKS` of a destination, valid or not.
 
     >>> kind_of("out/walk.csv"), kind_of("mqtt://host/yard"), kind_of("events/"), kind_of("-")
     ('.csv', 'mqtt://', '/', '-')
@@ -222,7 +222,7 @@ def kind_of(dest: str) -> str:
 
 
 def sink_of(dest: str) -> Row:
-    """Return the row of a destination; raises VideoError if there is none."""
+    """Return the row of a destination; raises VideoError if it is unknown."""
     row = SINKS.get(kind_of(dest))
     if row is None:
         raise VideoError(
@@ -233,12 +233,12 @@ def sink_of(dest: str) -> Row:
 
 
 def is_file(dest: str) -> bool:
-    """Return whether a destination is a file: not standard output, no address, and no folder."""
+    """Return True if a destination is a file: not standard output, an address or a folder."""
     return dest != STDOUT and "://" not in dest and not dest.endswith("/")
 
 
 def check_result(path: Path, *, overwrite: bool, source: str = "", made: Path | None = None) -> None:
-    """Raise VideoError if a file is of the source, if another process writes it, or as `files.check_file` does."""
+    """Raise VideoError if a file belongs to the source, is locked, or fails `catstream.base.files.check_file`."""
     if source and path.exists() and Path(source).exists() and path.samefile(source):
         raise VideoError(f"{path} is the source, which would be lost: use another name or folder")
     if Path(source).is_dir() and path.exists() and path.suffix in VIDEOS | IMAGES and Path(source) in path.parents:
@@ -248,19 +248,16 @@ def check_result(path: Path, *, overwrite: bool, source: str = "", made: Path | 
 
 
 def check_sink(dest: str, options: SinkOptions, source: str = "") -> None:
-    """Raise VideoError if there is no such destination, or the address or an option is invalid.
-
-    Also if it is the video of a live `source`.
-    """
-    home = sink_of(dest).load()
+    """Raise VideoError if a destination is unknown, its address or an option is invalid, or `source` is unsuitable."""
+    sink = sink_of(dest).load()
     if is_file(dest) and dest.endswith(".mp4") and is_live(source):
         raise VideoError(f"a video needs its frames once more, but {source} is live: omit the video")
-    if hasattr(home, "check"):
-        home.check(dest, options)
+    if hasattr(sink, "check"):
+        sink.check(dest, options)
 
 
 def redacted(dest: str) -> str:
-    """Return a destination as messages name it: an address without its password, of a webhook its host alone.
+    """Return a destination for messages: an address without its password, and only the host of a webhook.
 
     >>> redacted("mqtt://me:secret@10.0.0.7/yard"), redacted("https://example.com/hooks/T0/B0/secret")
     ('mqtt://10.0.0.7/yard', 'https://example.com/...')
@@ -273,5 +270,5 @@ def redacted(dest: str) -> str:
 
 
 def open_sink(dest: str, origin: Origin) -> Sink:
-    """Open the sink of a destination; raises VideoError if that is not possible."""
+    """Open the sink of a destination; raises VideoError if this fails."""
     return cast(Sink, sink_of(dest).load()(dest, origin))

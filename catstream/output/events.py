@@ -1,4 +1,4 @@
-"""Events of objects, detected in their tracks, and of the run, detected in its health reports.
+"""Detects events of objects in their tracks, and events of the run in its health reports.
 
 >>> from catstream.base.box import Box
 >>> events = Events({"door": ((50, 0), (90, 0), (90, 90), (50, 90))}, WHEN | {"lost": 1.0})
@@ -30,7 +30,7 @@ from catstream.wire.messages import Health, Track
 #: x and y, in pixels of the frame.
 Point = tuple[float, float]
 
-#: Kind of an event -> when there is one.
+#: Descriptions of the kinds of events.
 KINDS = {
     "found": "an object has a box for the first time",
     "lost": "it has had no box for some seconds",
@@ -44,14 +44,14 @@ KINDS = {
     "write_resumed": "they can be written again",
 }
 
-#: All kinds; the value of "lost" is the seconds without a box after which an object is lost, and without a source.
+#: All kinds; the value of "lost" is the time in seconds without a box, or without a source, that counts as lost.
 WHEN = dict.fromkeys(KINDS, 0.0) | {"lost": 2.0}
 
-#: Pixels by which a centre has to be outside a zone to leave it: hysteresis for a box that stays on the edge.
+#: Hysteresis: distance from a zone, in pixels, at which a centre has left it.
 MARGIN = 10.0
 
-#: An object without a track ends after more frames than this with tracks of other objects. A subscriber that loses
-#: messages may miss an object in two frames, and receive another object first in the next.
+#: An object without a track ends after more than this number of frames with tracks of other objects. A subscriber that
+#: loses messages may miss an object in two frames, and receive another object first in the next frame.
 _FORGOTTEN_FRAMES = 3
 
 
@@ -60,10 +60,10 @@ class Event:
     """An event of an object or of the run.
 
     kind   one of `KINDS`
-    track  of the object in the frame of the event; its last one if it ended; None if it is of the run
-    zone   name of the zone; empty if it is about none
-    facts  of an event of the run: its `source`; for how many `seconds` that was lost, or the number of `frames` that
-           are not written and the `reason`
+    track  track of the object in the frame of the event, or its last one if it ended; None for an event of the run
+    zone   name of the zone, or empty
+    facts  for an event of the run: its `source`, and the `seconds` for which it was lost, or the number of `frames`
+           that were not written and the `reason`
     """
 
     kind: str
@@ -72,7 +72,7 @@ class Event:
     facts: Mapping[str, Any] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, Any]:
-        """The fields by name, of plain types for JSON, with the object and time of the track."""
+        """The fields by name, with the types of JSON, and with the object and time of the track."""
         if self.track is None:
             return {"event": self.kind, **dict.fromkeys(("object", "time", "zone", "track")), **self.facts}
         track = self.track.to_dict()
@@ -82,9 +82,12 @@ class Event:
 
 @dataclass(slots=True)
 class _Object:
-    """An object: its newest track, the number of frames up to it, the time of its last box (None before the first).
+    """The state of an object.
 
-    is_known  whether the source has not been lost since that track
+    track     newest track
+    frames    number of frames up to it
+    box_time  time of the last box, None before the first
+    is_known  False if the source was lost after the newest track
     """
 
     track: Track
@@ -96,16 +99,16 @@ class _Object:
 
 
 class Events:
-    """Detects events in the tracks of a run, in their order; it does no I/O, and uses the time of the tracks.
+    """Detects events in the tracks of a run, in order; without I/O, and with the time of the tracks.
 
     source_lost  whether the source is lost
     tracks       newest track of each object
 
     A zone is entered as soon as the centre of a box is in it, and left if the centre is more than `MARGIN` pixels
-    outside, or the object is lost or ends. So `left` follows each `entered`, and a lost object is in no zone.
+    outside, or if the object is lost or ends. Each `entered` is followed by `left`, and a lost object is in no zone.
 
     zones : corners x, y of each polygon, in pixels, by name; SettingsError if one is invalid, see `check_zones`
-    when : kinds of events that are returned; the value of `lost` is the seconds without a box or a source
+    when : kinds of events that are returned, see `WHEN`
     """
 
     def __init__(self, zones: Mapping[str, Sequence[Point]], when: Mapping[str, float] = WHEN) -> None:
@@ -115,10 +118,10 @@ class Events:
         self._objects: dict[str, _Object] = {}
         self.source_lost, self._source, self._source_seconds = False, "", 0.0
         self._write_problems: dict[str, str] = {}  # by process
-        self._frame, self._frames = -1, 0  # number of the newest frame, and how many there were
+        self._frame, self._frames = -1, 0  # number of the newest frame, and number of frames so far
 
     def update(self, tracks: Sequence[Track]) -> list[Event]:
-        """Return the events of further tracks of a frame, passed together or one by one."""
+        """Return the events of tracks of a frame, passed together or one by one."""
         events: list[Event] = []
         for track in tracks:
             if track.frame != self._frame:
@@ -130,7 +133,7 @@ class Events:
         return self._selected(events)
 
     def update_run(self, report: Health) -> list[Event]:
-        """Return the events of the run in the next health report of one of its processes.
+        """Return the events of the run in the next health report of a process.
 
         The status of an object is unknown from `source_lost` to its next track.
         """
@@ -146,7 +149,7 @@ class Events:
                 self.source_lost = False
                 events["source_back"] = {"seconds": round(self._source_seconds, 1)}
             self._source_seconds = seconds
-        if (failed := counters.get("write_failed")) is not None:  # a restarted process has not tried it yet
+        if (failed := counters.get("write_failed")) is not None:  # None until a restarted process has tried to write
             before, problem = self._write_problems.get(process, ""), report.trouble if failed else ""
             self._write_problems[process] = problem
             if bool(before) != bool(problem):
@@ -159,13 +162,13 @@ class Events:
         return [item.track for item in self._objects.values()]
 
     def close(self) -> list[Event]:
-        """Return the last events: all objects end."""
+        """End all objects, and return the last events."""
         return self._selected([event for name in [*self._objects] for event in self._end(name)])
 
     def status(self, name: str) -> dict[str, Any] | None:
         """The status of an object: whether it is present, and the names of its zones; None if it ended.
 
-        If it is unknown, `present` is None, and there are no zones.
+        While the source is lost, `present` is None, and there are no zones.
         """
         item = self._objects.get(name)
         if item is None:
@@ -178,13 +181,15 @@ class Events:
         return [event for event in events if event.kind in self._when]
 
     def _of(self, track: Track) -> Iterator[Event]:
-        """Yield the events of a track, except the end of other objects."""
+        """Yield the events of a track."""
+        # Step 1: a new object with the same name ends the old one.
         item = self._objects.get(track.object)
         if item is not None and item.track.began != track.began:
             yield from self._end(track.object)
             item = None
         item = item or self._objects.setdefault(track.object, _Object(track))
         item.track, item.frames, item.is_known = track, self._frames, True
+        # Step 2: an absent object is lost after some seconds.
         if track.box is None:
             if item.box_time is None or item.lost or track.time - item.box_time < self._lost_seconds:
                 return
@@ -192,6 +197,7 @@ class Events:
             yield from self._leave_zones(item)
             yield Event("lost", track)
             return
+        # Step 3: a present object is found or returns, and enters or leaves zones.
         if item.box_time is None or item.lost:
             yield Event("found" if item.box_time is None else "returned", track)
         item.box_time, item.lost = track.time, False
@@ -216,10 +222,10 @@ class Events:
 
 
 def check_zones(zones: Mapping[str, Sequence[Point]], size: tuple[int, int] | None = None) -> None:
-    """Raise SettingsError if a zone has an invalid name or is no simple polygon in pixels.
+    """Raise SettingsError if a zone has an invalid name, is not a simple polygon in pixels, or is outside the frame.
 
-    With the `size` of a frame, also if it is outside. The rules for names are those for objects: they are safe in
-    topics, file names and templates.
+    Without the `size` of a frame, the last condition is not checked. The rules for the names of objects apply: such
+    names are safe in topics, file names and templates.
 
     >>> check_zones({"door": [(0.1, 0.1), (0.9, 0.1), (0.9, 0.9)]})
     Traceback (most recent call last):
@@ -235,7 +241,7 @@ def check_zones(zones: Mapping[str, Sequence[Point]], size: tuple[int, int] | No
 
 
 def _defect(corners: np.ndarray, size: tuple[int, int] | None) -> str:
-    """Return the defect of the corners of a zone, float32 (n, 2); empty if they are valid."""
+    """Describe the defect of the corners of a zone, float32 (n, 2); empty if they are valid."""
     if len(corners) < 3:
         return f"a polygon has at least 3 corners, got {len(corners)}"
     if not np.isfinite(corners).all():

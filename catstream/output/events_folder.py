@@ -1,9 +1,9 @@
-"""A folder of events: a line of JSON for each in `events.ndjson`, and a JPEG file with the boxes of its frame.
+"""A folder of events: a line of JSON for each in `events.ndjson`, and a JPEG file of the frame with its boxes.
 
     20261128T133015.250Z-entered-anna-door.jpg    time (UTC), kind, object and zone
 
 If the pictures exceed the limit, the oldest are removed; `events.ndjson` is renamed to `events.1.ndjson` at 10 MB.
-Other files in the folder stay.
+Other files in the folder are not changed.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ from catstream.output.remote import EventStream, Warnings
 from catstream.video.drawing import Colours, draw_preview
 from catstream.wire.messages import Preview, Track
 
-_OURS = re.compile(r"\d{8}T\d{6}\.\d{3}Z-.*\.jpg")
+_PICTURE = re.compile(r"\d{8}T\d{6}\.\d{3}Z-.*\.jpg")
 _UNSAFE = re.compile(r"[^\w.]+")
 _TRACKS = 1024  # frames whose tracks are stored for the pictures
 _LOG_BYTES = 10_000_000
 
 
 class EventsFolder(Sink):
-    """Writes the files; a folder that cannot be written to is a warning, and the run continues."""
+    """Writes the files; if the folder is not writable, a warning is logged, and the run continues."""
 
     def __init__(self, dest: str, origin: Origin) -> None:
         self.check(dest, origin.options)
@@ -40,16 +40,16 @@ class EventsFolder(Sink):
         self._events, self._warnings = EventStream(origin, has_pictures=True), Warnings(dest)
         self._tracks: dict[int, list[Track]] = {}  # by frame
         self._colours = Colours()
-        ours = sorted(file for file in self._folder.iterdir() if _OURS.fullmatch(file.name))
-        self._files = deque((file, file.stat().st_size) for file in ours)
+        pictures = sorted(file for file in self._folder.iterdir() if _PICTURE.fullmatch(file.name))
+        self._files = deque((file, file.stat().st_size) for file in pictures)
 
     @staticmethod
     def check(dest: str, _: SinkOptions) -> None:
-        """Make the folder; raise VideoError if that is not possible."""
+        """Create the folder; raise VideoError if this fails."""
         try:
             Path(dest).mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise VideoError(f"cannot make the folder {dest}: {error.strerror}") from None
+            raise VideoError(f"cannot create the folder {dest}: {error.strerror}") from None
 
     def write(self, frame: TrackedFrame) -> None:
         self._tracks.setdefault(frame.number, []).extend(frame.tracks)
@@ -58,7 +58,7 @@ class EventsFolder(Sink):
         self._write(self._events.update(frame.tracks))
 
     def idle(self) -> None:
-        """Write the events that have waited for a picture."""
+        """Write the events that no longer wait for a picture."""
         self._write(self._events.update())
 
     def close(self) -> None:
@@ -78,7 +78,7 @@ class EventsFolder(Sink):
                 self._warnings.working()
 
     def _write_picture(self, event: Event, picture: Preview) -> str:
-        """Write the picture of an event, remove the oldest ones above the limit, and return the name of the file."""
+        """Write the picture of an event, remove the oldest pictures above the limit, and return the file name."""
         tracks = self._tracks.get(picture.frame, [])
         self._colours.keep(track.object for track in tracks)
         name = "" if event.track is None else event.track.object
@@ -88,7 +88,7 @@ class EventsFolder(Sink):
         write_atomically(file, data)
         self._files.append((file, len(data)))
         while len(self._files) > 1 and sum(size for _, size in self._files) > self._limit:
-            with suppress(OSError):  # another program may have moved it
+            with suppress(OSError):  # another program may have removed it
                 self._files.popleft()[0].unlink()
         return file.name
 

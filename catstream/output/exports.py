@@ -1,6 +1,6 @@
-"""THE TABLE of formats that are made from a log afterwards: `catstream export LOG DEST`.
+"""The table of export formats, into which a log is converted: `catstream export LOG DEST`.
 
-A new one is a row here, a function, and a line in docs/how-to/sinks.md.
+A new format is a row here, a function, and a line in docs/how-to/sinks.md.
 """
 
 from __future__ import annotations
@@ -20,11 +20,10 @@ from catstream.output.track_log import CsvSink
 
 
 def write_mot(frames: Iterable[TrackedFrame], path: Path, _: About) -> None:
-    """Write boxes as the tools of MOTChallenge read results: `frame,id,x,y,w,h,conf,-1,-1,-1`.
+    """Write boxes in the format of MOTChallenge: `frame,id,x,y,w,h,conf,-1,-1,-1`.
 
-    Frames of the source, ids and pixels count from 1 there. The first object that appears has the id 1; another object
-    that was given the same name has another one. A frame without any object has no line, so the file does not say how
-    many frames there were.
+    Frames of the source, ids and pixels count from 1. Ids follow the order of appearance; a new object that reuses a
+    name has a new id. Frames without objects have no line, so the file does not contain the number of frames.
     """
     ids: dict[tuple[str, int], int] = {}
     with path.open("w", encoding="utf-8") as file:
@@ -37,7 +36,7 @@ def write_mot(frames: Iterable[TrackedFrame], path: Path, _: About) -> None:
 
 
 def write_csv(frames: Iterable[TrackedFrame], path: Path, _: About) -> None:
-    """Write the CSV file of a run, which tables and pandas read."""
+    """Write the CSV file of a run, for spreadsheets and pandas."""
     with closing(CsvSink(str(path), Origin())) as sink:
         for frame in frames:
             sink.write(frame)
@@ -51,11 +50,11 @@ def write_sqlite(frames: Iterable[TrackedFrame], path: Path, about: About) -> No
 class Format:
     """A row of the table.
 
-    write    writes the frames, which it may iterate over more than once, to a path; may return a note for the user
+    write    function that writes the frames to a path, and may return a note for the user; it may iterate repeatedly
     meaning  a line of the help
-    suffix   of the file; empty for a folder
-    sized    whether it has classes, and needs the size of a frame
-    images   whether it refers to the images of the source
+    suffix   suffix of the file; empty for a folder
+    sized    whether the format has classes and requires the size of a frame
+    images   whether the format refers to the images of the source
     """
 
     write: Callable[[Iterable[TrackedFrame], Path, About], str | None]
@@ -65,7 +64,7 @@ class Format:
     images: bool = False
 
 
-#: Name of a format -> its row.
+#: Formats by name.
 EXPORTS = {
     "mot": Format(write_mot, "MOT text: frame,id,x,y,w,h,score,-1,-1,-1, counted from 1", ".txt"),
     "csv": Format(write_csv, "the CSV file of a run", ".csv"),
@@ -78,7 +77,7 @@ EXPORTS = {
 
 
 def export_of(path: Path, name: str | None) -> Format:
-    """Return a format by its name, or else by the longest suffix; raises VideoError if there is none."""
+    """Return a format by its name, or by the longest matching suffix; raises VideoError if it is unknown."""
     formats = [form for form in EXPORTS.values() if form.suffix and path.name.endswith(form.suffix)]
     if name is None and not formats:
         raise VideoError(f"unknown format of {path}: pass --format, one of {', '.join(EXPORTS)}")
@@ -86,9 +85,9 @@ def export_of(path: Path, name: str | None) -> Format:
 
 
 def check_export(path: Path, form: Format, *, overwrite: bool, log: Path) -> None:
-    """Raise VideoError if an export would replace something, unless `overwrite`.
+    """Raise VideoError if an export would replace files, unless `overwrite`.
 
-    The images of a data set may be there before its labels.
+    The images of a data set may exist before its labels.
     """
     if form.suffix:
         check_result(path, overwrite=overwrite, source=str(log))
@@ -99,10 +98,10 @@ def check_export(path: Path, form: Format, *, overwrite: bool, log: Path) -> Non
 
 
 def export(frames: Iterable[TrackedFrame], path: Path, form: Format, about: About) -> str:
-    """Make a file from the frames of a log, which gets its name once it is complete, or the files of a folder.
+    """Convert the frames of a log to a file, which is created atomically, or to the files of a folder.
 
-    Returns a note for the user, mostly empty. Raises VideoError if the files cannot be written, or if the size of a
-    frame is needed and unknown.
+    Returns a note for the user, or "". Raises VideoError if the files cannot be written, or if the format requires the
+    size of a frame and it is unknown.
     """
     if form.sized and about.size is None:
         raise VideoError(

@@ -1,14 +1,15 @@
-"""An MQTT broker: events, the state of each object, and its discovery by Home Assistant.
+"""Publishes events and the state of each object to an MQTT broker, with discovery by Home Assistant.
 
     TOPIC/availability     "online"; "offline" at the end, and as last will if the connection breaks; retained
     TOPIC/source           "online", or "lost" while the source is lost; retained
-    TOPIC/events           each event, as `EventStream.to_json` makes it
-    TOPIC/objects/NAME     the newest track of an object, with `present`, `zones` and `sent`, as often as the option
-                           `rate` says, and as soon as `present` or `zones` changes; retained, and removed if the object
-                           ends. While the source is lost, `present` is null. NAME is "-" for the object without a name
+    TOPIC/events           each event, by `EventStream.to_json`
+    TOPIC/objects/NAME     the newest track of an object, with `present`, `zones` and `sent`, at the option `rate`, and
+                           at each change of `present` or `zones`; retained, and removed when the object ends. While the
+                           source is lost, `present` is null. NAME is "-" for the object without a name
     homeassistant/binary_sensor/catstream/ID/config     a sensor for each object, and for each object in each zone
 
-All have QoS 1. While the broker is away, events wait for it, and states are dropped, since the next one replaces them.
+All have QoS 1. While the broker is unreachable, events are queued, and states are dropped, because newer ones replace
+them.
 """
 
 from __future__ import annotations
@@ -33,11 +34,11 @@ from catstream.output.events import Event
 from catstream.output.remote import CLOSE_SECONDS, QUEUED, EventStream, Warnings, reason_of, split
 from catstream.wire.messages import Preview
 
-_LONGEST_PAUSE = 30  # seconds between two attempts to connect, from 1 on
-_KEEPALIVE = 30  # seconds without a message after which client and broker test whether the other one is there
-_REPLY_SECONDS = 10  # in which a broker accepts or refuses a connection
-_ACCEPT_SECONDS = 1.0  # limit for the messages before the last one to arrive
-_EXPIRE_SECONDS = 10  # without a state after which Home Assistant shows a sensor as unavailable, at least
+_LONGEST_PAUSE = 30  # maximum of the exponential backoff between two attempts to connect, in seconds
+_KEEPALIVE = 30  # MQTT keepalive in seconds
+_REPLY_SECONDS = 10  # timeout for the broker to accept or refuse a connection
+_ACCEPT_SECONDS = 1.0  # timeout for earlier messages before the last one is sent
+_EXPIRE_SECONDS = 10  # minimum time without a state after which Home Assistant shows a sensor as unavailable
 _STATES = "{true: 'ON', false: 'OFF'}"  # in a template of Home Assistant
 
 
@@ -48,9 +49,9 @@ class _Link(Enum):
 
 
 class MqttSink(Sink):
-    """Publishes from the thread of paho-mqtt; if `QUEUED` messages wait there, further ones are missed.
+    """Publishes from the thread of paho-mqtt; if `QUEUED` messages wait, further ones are dropped.
 
-    missed  messages that were dropped; once it is closed, all that the broker has not acknowledged
+    missed  number of dropped messages; after `close`, of all messages that the broker has not acknowledged
     """
 
     def __init__(self, dest: str, origin: Origin) -> None:
@@ -58,10 +59,12 @@ class MqttSink(Sink):
         self._topic, self._options = unquote(url.path)[1:], origin.options
         self._events, self._warnings = EventStream(origin, has_pictures=origin.options.picture), Warnings(dest)
         self._availability, self._source = f"{self._topic}/availability", f"{self._topic}/source"
-        self._source_state, self._deadline = "", 0.0  # state that was published; of the delivery, once it has ended
-        self._sent: dict[str, tuple[object, float]] = {}  # of each object, the last status, and when the next is due
+        self._source_state = ""  # last published state of the source
+        self._deadline = 0.0  # for the delivery, once the sink has ended
+        self._sent: dict[str, tuple[object, float]] = {}  # last status of each object, and time of the next one
         self._published = self._acknowledged = self.missed = 0
-        self._is_away = self._is_back = False  # a broker that is back may have lost retained messages
+        self._is_away = False
+        self._is_back = False  # whether to publish retained messages again: the broker may have lost them
         self._link, self._attempted = _Link.CONNECTING, time.monotonic()
         self._client = client = Client(CallbackAPIVersion.VERSION2)
         client.max_queued_messages_set(QUEUED)
@@ -81,11 +84,12 @@ class MqttSink(Sink):
 
     @staticmethod
     def check(dest: str, _: SinkOptions) -> None:
-        """Raise VideoError if this is no address of a broker with a topic."""
+        """Raise VideoError if the address of the broker or the topic is invalid."""
         _checked(dest)
 
     def write(self, frame: TrackedFrame) -> None:
-        """Publish the events of a frame, and the states that have changed or are due."""
+        """Publish the events of a frame, and states that have changed or whose interval has elapsed."""
+        # Step 1: the state of the connection, and retained messages after a reconnection.
         if self._link is _Link.CONNECTED:
             self._warnings.working()
         elif self._link is _Link.CONNECTING and time.monotonic() - self._attempted > _REPLY_SECONDS:
@@ -96,18 +100,20 @@ class MqttSink(Sink):
             for name in self._sent:
                 self._announce(name)
                 self._sent[name] = None, 0.0
+        # Step 2: the state of the source, and events.
         ready, events = self._events.update(frame.tracks), self._events.events
         if (source := "lost" if events.source_lost else "online") != self._source_state:
             self._source_state = source
             self._publish(self._source, source, retain=True)
         self._publish_events(ready)
+        # Step 3: the states of the objects.
         now = time.monotonic()
         for track in events.tracks:
             if track.object not in self._sent:
                 self._announce(track.object)
             status = events.status(track.object) or {}
-            last, due = self._sent.get(track.object, (None, now))
-            if status != last or (frame.tracks and now >= due):
+            last, next_time = self._sent.get(track.object, (None, now))
+            if status != last or (frame.tracks and now >= next_time):
                 self._sent[track.object] = status, now + 1 / self._options.rate
                 state = {**track.to_dict(), **status, "sent": time.time()}
                 if self._is_away:
@@ -119,7 +125,7 @@ class MqttSink(Sink):
             self._remove(name)
 
     def idle(self) -> None:
-        """Publish the events that have waited for a picture, and whether the source is lost."""
+        """Publish the events that no longer wait for a picture, and the state of the source."""
         self.write(TrackedFrame(()))
 
     def end(self) -> None:
@@ -130,19 +136,19 @@ class MqttSink(Sink):
         self._publish_events(self._events.close())
         for name in [*self._sent]:
             self._remove(name)
-        # Until the broker accepts the connection, paho sends new messages before those that it has queued.
+        # Until the broker accepts the connection, paho sends new messages before queued ones.
         limit = time.monotonic() + _ACCEPT_SECONDS
         while self._acknowledged < self._published and self._link is not _Link.LOST and time.monotonic() < limit:
             time.sleep(0.01)
         self._publish(self._availability, "offline", retain=True)
 
     def close(self) -> None:
-        """Wait some seconds after the end until the broker has everything, and warn about what it missed."""
+        """Wait for the acknowledgements until the deadline, and warn about missed messages."""
         self.end()
         while self._acknowledged < self._published and time.monotonic() < self._deadline:
             time.sleep(0.02)
         self._client.disconnect()
-        if self._acknowledged == self._published:  # else it would wait for the broker; the thread ends by itself
+        if self._acknowledged == self._published:  # otherwise it would wait for the broker; the thread is a daemon
             self._client.loop_stop()
         self.missed += self._published - self._acknowledged
         if self.missed:
@@ -167,7 +173,7 @@ class MqttSink(Sink):
         self._publish(self._state_topic(name), b"", retain=True)
 
     def _announce(self, name: str, *, ended: bool = False) -> None:
-        """Have Home Assistant make the sensors of an object, or remove them if it has ended."""
+        """Let Home Assistant create the sensors of an object, or remove them if it has `ended`."""
         state, label = self._state_topic(name), name or "object"
         sensors = {label: "value_json.present"}
         for zone in self._options.zone:
@@ -221,12 +227,12 @@ class MqttSink(Sink):
 
 
 def _id(text: str) -> str:
-    """Letters and digits that stand for a text, the same in every run."""
+    """A hash of a text in hexadecimal digits, the same in every run."""
     return blake2b(text.encode(), digest_size=8).hexdigest()
 
 
 def _checked(dest: str) -> SplitResult:
-    """The parts of the address; VideoError if it is not valid."""
+    """Parse the address; VideoError if it is invalid."""
     url = split(dest, "mqtt://[USER:PASSWORD@]HOST[:PORT]/TOPIC")
     if url.path in ("", "/") or set("+#@") & set(unquote(url.path)) or set("?#") & set(dest):
         raise VideoError(f"{redacted(dest)} has no valid topic: expected mqtt://HOST/TOPIC, without any of + # ? @")

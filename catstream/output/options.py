@@ -1,4 +1,4 @@
-"""THE TABLE of options of destinations: options of `catstream sink`, keys of a fleet's file."""
+"""The table of options of destinations: options of `catstream sink`, and keys of a fleet's file."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from catstream.errors import SettingsError, errors_in
 from catstream.output.destinations import STDOUT, Rotation, SinkOptions, check_sink, kind_of
 from catstream.output.events import KINDS, WHEN, Point, check_zones
 
-_LONGEST_SECONDS = 86400.0  # without a box, after which an object is lost
+_LONGEST_SECONDS = 86400.0  # maximum value of "lost"
 
 _UNITS = {"h": 3600.0, "d": 86400.0, "MB": 1e6, "GB": 1e9}
 _LOGS = (".ndjson", ".csv")
@@ -25,7 +25,7 @@ _MQTT, _HTTP, _FOLDER = ("mqtt://", "mqtts://"), ("http://", "https://"), ("/",)
 
 
 def parse_zones(zones: Mapping[str, str]) -> dict[str, tuple[Point, ...]]:
-    """Return the corners of zones; SettingsError if one is invalid.
+    """Parse the corners of zones; SettingsError if a zone is invalid.
 
     >>> parse_zones({"door": "300,80 420,80 420,400"})
     {'door': ((300.0, 80.0), (420.0, 80.0), (420.0, 400.0))}
@@ -41,7 +41,7 @@ def parse_zones(zones: Mapping[str, str]) -> dict[str, tuple[Point, ...]]:
 
 
 def parse_when(text: str) -> dict[str, float]:
-    """Return the kinds of events, with the seconds of `lost`; SettingsError if the text is invalid.
+    """Parse kinds of events, with the seconds of `lost`; SettingsError if the text is invalid.
 
     >>> parse_when("lost=10,entered")
     {'lost': 10.0, 'entered': 0.0}
@@ -59,13 +59,13 @@ def parse_when(text: str) -> dict[str, float]:
 
 
 def parse_rotation(text: str) -> Rotation:
-    """Return when a log is rotated; SettingsError if the text is invalid.
+    """Parse the period or size of a rotated log; SettingsError if the text is invalid.
 
     >>> parse_rotation("1d"), parse_rotation("500MB")
     (Rotation(seconds=86400.0, bytes=inf), Rotation(seconds=inf, bytes=500000000.0))
     """
     if not (match := re.fullmatch(r"([1-9]\d*)(h|d|MB|GB)", text)):
-        raise SettingsError(f"expected a time or a size, as 12h, 1d, 500MB or 2GB, got {text!r}")
+        raise SettingsError(f"expected a time or a size such as 12h, 1d, 500MB or 2GB, got {text!r}")
     size = int(match[1]) * _UNITS[match[2]]
     return Rotation(size, inf) if match[2] in "hd" else Rotation(inf, size)
 
@@ -75,11 +75,11 @@ class Option:
     """A row of the table. Its name is a field of `SinkOptions`, a key of a file, and an option of the command line.
 
     kind      type of a value
-    expected  what a value must be, for an error
-    metavar   stands for the value in the help; empty for a flag
+    expected  description of valid values, for an error
+    metavar   placeholder for the value in the help; empty for a flag
     help      a line of the help
-    users     the destinations that it affects, as in `SINKS`
-    convert   makes the field of `SinkOptions` from a value
+    users     keys of `SINKS` of the destinations with this option
+    convert   converts a value to the field of `SinkOptions`
     """
 
     kind: Any
@@ -142,7 +142,7 @@ OPTIONS = {
     ),
 }
 
-#: Key of the file of a fleet -> its type, and what its value must be.
+#: Types and descriptions of valid values, by the key of a fleet's file.
 KEYS: dict[str, tuple[Any, str]] = {
     "write": (list[Annotated[str, Meta(min_length=1)]], 'destinations, for example ["tracks/{stream}.ndjson"]'),
     **{name: (option.kind, option.expected) for name, option in OPTIONS.items()},
@@ -152,7 +152,7 @@ KEYS: dict[str, tuple[Any, str]] = {
 def parse(values: Mapping[str, Any], destinations: Sequence[str], name_of: Callable[[str], str] = str) -> SinkOptions:
     """Return the options of destinations from values by the names in the table.
 
-    SettingsError if a value is invalid or has no effect on these destinations; `name_of` is the name for the user.
+    SettingsError if a value is invalid or has no effect on these destinations; `name_of` returns a name for the user.
     """
     kinds, fields = {kind_of(dest) for dest in destinations}, {}
     for name, value in values.items():
@@ -167,11 +167,11 @@ def parse(values: Mapping[str, Any], destinations: Sequence[str], name_of: Calla
             except msgspec.ValidationError:
                 raise SettingsError(f"must be {option.expected}, got {value!r}") from None
     options = SinkOptions(**fields)
-    of_zones = [kind for kind in ("entered", "left") if kind in options.when]
-    if "when" in values and of_zones and not options.zone:
+    zone_events = [kind for kind in ("entered", "left") if kind in options.when]
+    if "when" in values and zone_events and not options.zone:
         when, zone = name_of("when"), name_of("zone")
-        raise SettingsError(f"{when} {','.join(of_zones)} has no effect without a zone: add {zone}")
-    if options.zone and not of_zones and kinds.isdisjoint(_MQTT):  # whose states have zones
+        raise SettingsError(f"{when} {','.join(zone_events)} has no effect without a zone: add {zone}")
+    if options.zone and not zone_events and kinds.isdisjoint(_MQTT):  # MQTT states contain zones
         raise SettingsError(f"{name_of('zone')} has no effect: add entered or left to {name_of('when')}")
     return options
 
@@ -181,7 +181,8 @@ def destinations(
 ) -> tuple[tuple[str, ...], SinkOptions]:
     """Return the destinations of a stream and their options, from the `KEYS` of a file in a folder.
 
-    Relative paths count from the folder, and `{stream}` is the name of the stream. SettingsError if one is invalid.
+    Paths are relative to the folder, and `{stream}` is replaced by the name of the stream. SettingsError if a value is
+    invalid.
     """
 
     def located(path: str) -> str:
@@ -189,13 +190,13 @@ def destinations(
 
     named = dict.fromkeys(dest.replace("{stream}", stream) for dest in values.get("write", ()))
     destinations = tuple(dest if "://" in dest or dest == STDOUT else located(dest) for dest in named)
-    given = {name: value for name, value in values.items() if name != "write"}
-    if "secret_file" in given:
-        given["secret_file"] = located(given["secret_file"].replace("{stream}", stream))
-    options = parse(given, destinations)
+    rest = {name: value for name, value in values.items() if name != "write"}
+    if "secret_file" in rest:
+        rest["secret_file"] = located(rest["secret_file"].replace("{stream}", stream))
+    options = parse(rest, destinations)
     with errors_in("write", SettingsError):
         for dest in destinations:
             if dest == STDOUT:
-                raise SettingsError("there is no standard output: pass a file or an address")
+                raise SettingsError("a fleet has no standard output: pass a file or an address")
             check_sink(dest, options, without_password(source))
     return destinations, options

@@ -1,4 +1,4 @@
-"""Shared by the destinations on the network: events as JSON, warnings, and the check of an address."""
+"""Common parts of the network destinations: events as JSON, warnings, and the check of an address."""
 
 from __future__ import annotations
 
@@ -20,40 +20,40 @@ from catstream.output.destinations import Origin, redacted
 from catstream.output.events import Event, Events
 from catstream.wire.messages import Health, Preview, Track
 
-#: Messages that wait for a destination that is away or slow; further ones are dropped.
+#: Length of the queue for a slow or unreachable destination; further messages are dropped.
 QUEUED = 256
 
-#: Seconds at the end of a run in which the backlog is sent, or written to a locked database.
+#: Timeout at the end of a run for sending the backlog, or for writing it to a locked database.
 CLOSE_SECONDS = 5.0
 
-_STABLE_SECONDS = 10.0  # without a failure, after which a destination has recovered
-_REPORT_SECONDS = 0.5  # between two looks for a health report; a process sends one a second
-_PICTURE_SECONDS = 2.0  # that an event waits for a picture of its frame
+_STABLE_SECONDS = 10.0  # time without a failure after which a destination has recovered
+_REPORT_SECONDS = 0.5  # polling interval for health reports, which arrive once a second
+_PICTURE_SECONDS = 2.0  # timeout of an event for a picture of its frame
 
 _log = logging.getLogger(__name__)
 
 
 class Warnings:
-    """Warns about a destination, whose address is logged without its password.
+    """Logs problems of a destination, with its address without the password.
 
     Hysteresis: each problem is logged once, until the destination has worked for `_STABLE_SECONDS` without a failure.
-    So a receiver that alternates between two failures, or accepts and closes each connection, does not fill the log.
+    A receiver that alternates between two failures, or accepts and closes each connection, does not fill the log.
     """
 
     def __init__(self, dest: str) -> None:
         self._address = redacted(dest)
-        self.problems: dict[str, None] = {}  #: since it has worked, in order
+        self.problems: dict[str, None] = {}  #: problems since the last recovery, in order
         self._working_since: float | None = None
 
     def failed(self, problem: str) -> None:
-        """Log a problem of the destination; its text has no part that changes from one attempt to the next."""
+        """Log a problem once. Its text must be the same for each attempt."""
         self._working_since = None
         if problem not in self.problems:
             self.problems[problem] = None
             self.log(problem)
 
     def working(self) -> None:
-        """Note that the destination works; is called again and again while it does."""
+        """Record that the destination works; call this repeatedly."""
         now = time.monotonic()
         since = self._working_since = self._working_since or now
         if self.problems and now - since >= _STABLE_SECONDS:
@@ -65,15 +65,15 @@ class Warnings:
 
 
 class EventStream:
-    """Detects events, each with a picture if that is wanted: the first one of the frame of the event or a later one.
+    """Detects events and, with pictures, adds the first preview of the event's frame or of a later one.
 
-    If none arrives within `_PICTURE_SECONDS`, an event has the newest picture, None if there is none, as at once an
-    event of the run, which is detected in the health reports. Without pictures, events do not wait.
+    After `_PICTURE_SECONDS`, an event has the newest preview, or None. Events of the run, which are detected in the
+    health reports, have it at once. Without pictures, events do not wait.
     """
 
     def __init__(self, origin: Origin, *, has_pictures: bool) -> None:
         self.events = Events(origin.options.zone, origin.options.when)
-        self._waiting: deque[tuple[Event, float]] = deque()  # with the times up to which they wait
+        self._waiting: deque[tuple[Event, float]] = deque()  # each with its deadline
         self._newest: Preview | None = None
         self._previews: Subscription[Preview] | None = None
         self._reports: Subscription[Health] | None = None
@@ -84,32 +84,32 @@ class EventStream:
             self._previews = subscribe(origin.address, "previews", timeout=0)
 
     def update(self, tracks: Sequence[Track] = ()) -> list[tuple[Event, Preview | None]]:
-        """Return the events of further tracks, and those that have waited, with their pictures.
+        """Return the events that no longer wait, with their pictures; `tracks` may add events.
 
-        Call it without tracks while no frame arrives, so that their wait ends in time.
+        Call it without tracks while no frame arrives, so that deadlines are met.
         """
         now = time.monotonic()
         events = self.events.update(tracks)
         if now >= self._next_look:
             self._next_look = now + _REPORT_SECONDS
-            with suppress(SilenceError):  # no further report has arrived
+            with suppress(SilenceError):  # all reports were read
                 for report in self._reports or ():
                     events += self.events.update_run(report)
         self._waiting += [(event, now + _PICTURE_SECONDS) for event in events]
-        with suppress(SilenceError):  # no further picture has arrived
+        with suppress(SilenceError):  # all previews were read
             for preview in self._previews or ():
                 self._newest = preview
         ready = []
         while self._waiting:
-            event, due = self._waiting[0]
+            event, deadline = self._waiting[0]
             is_early = event.track is not None and (self._newest is None or self._newest.frame < event.track.frame)
-            if self._previews is not None and is_early and now < due:
+            if self._previews is not None and is_early and now < deadline:
                 break
             ready.append((self._waiting.popleft()[0], self._newest))
         return ready
 
     def close(self) -> list[tuple[Event, Preview | None]]:
-        """Return the last events; none if it is closed already."""
+        """Return the last events; empty if it is closed already."""
         for subscription in (self._previews, self._reports):
             if subscription is not None:
                 subscription.close()
@@ -118,10 +118,10 @@ class EventStream:
         return [(event, self._newest) for event in events]
 
     def to_json(self, event: Event, picture: Preview | None) -> bytes:
-        """Return a JSON object: `Event.to_dict`, `id`, `sent` in seconds since 1970, and `picture` if that is wanted.
+        """Return a JSON object: `Event.to_dict`, `id`, `sent` in seconds since 1970, and `picture` if enabled.
 
-        The picture is the JPEG file in Base64, the number of its frame, and the width and height of a frame, which may
-        be larger.
+        The picture has the JPEG file in Base64, the number of its frame, and the width and height of the frame, which
+        may be larger.
         """
         fields = {"id": uuid4().hex, "sent": time.time(), **event.to_dict()}
         if self._previews is not None:
@@ -133,7 +133,7 @@ class EventStream:
 
 
 def split(dest: str, form: str) -> SplitResult:
-    """Return the parts of an address; VideoError with its `form` and the defect, without its password."""
+    """Parse an address; VideoError with the defect and the expected `form`, without the password."""
     host = dest.partition("://")[2].partition("/")[0]
     wrong = ""
     if not all("!" <= letter <= "~" for letter in dest):
@@ -154,7 +154,7 @@ def split(dest: str, form: str) -> SplitResult:
 
 
 def reason_of(error: BaseException | None) -> str:
-    """Return why a connection failed, with what to do if the server and the address disagree about TLS."""
+    """Return the reason for a failed connection, with a remedy for certificate errors and TLS mismatches."""
     if isinstance(error, ssl.SSLCertVerificationError):
         return f"certificate verify failed: {error.verify_message}; for a CA of your own, set SSL_CERT_FILE"
     if isinstance(error, ssl.SSLError):

@@ -1,4 +1,4 @@
-"""Reports: self-contained HTML pages for any display, made from the templates in `templates/`."""
+"""Reports: self-contained HTML pages, rendered from the templates in `templates/`."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ COLOURS = ("#f25100", "#2b82d9", "#56bf9c", "#a63700", "#30b2f2", "#3f8c7f", "#1
 
 
 def write_page(path: Path, template: str, **values: object) -> Path:
-    """Write the page of a template atomically; all values are escaped."""
+    """Render a template to a page, atomically; all values are escaped."""
     page = _environment().get_template(template).render(values)
     with writing(path):
-        write_atomically(path, page.encode(errors="surrogateescape"))  # the name of a file need not be UTF-8
+        write_atomically(path, page.encode(errors="surrogateescape"))  # a file name need not be UTF-8
     return path
 
 
@@ -38,7 +38,7 @@ def _environment() -> Environment:
 
 
 def round_up(value: float) -> float:
-    """Return a round number that is not smaller, for the upper end of an axis.
+    """Round up to a limit for an axis.
 
     >>> round_up(3.1), round_up(731.0)
     (3.5, 750.0)

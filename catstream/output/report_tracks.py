@@ -1,4 +1,4 @@
-"""The report of a run, or of the runs of a batch: where each object was, how fast, and which frames to look at."""
+"""The report of a run or of a batch: presence and speed of each object, and doubtful frames."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ from catstream.video.frames import RATE, jpeg
 from catstream.video.source import open_source
 from catstream.wire.messages import Track
 
-_PICTURES = 8  #: most frames to look at in a video
-_SIDE = 480  #: of a picture, pixels
-_POINTS = 1000  #: of a curve, at most
-_BINS = 200  #: stretches of a video, of which the plot has mean speeds
-_SPEED_SECONDS = 0.25  #: of which a speed is the mean, at least
-_GAP_SECONDS = 1.0  #: without a frame, from which the source was lost, if it is also five intervals
+_PICTURES = 8  #: maximum number of pictures of doubtful frames
+_SIDE = 480  #: longest side of a picture, pixels
+_POINTS = 1000  #: maximum number of points of a curve
+_BINS = 200  #: number of intervals of a video in the plot of mean speeds
+_SPEED_SECONDS = 0.25  #: minimum duration over which a speed is averaged
+_GAP_SECONDS = 1.0  #: minimum time without a frame that counts as a lost source; also at least five intervals
 
 
 class Scale(NamedTuple):
@@ -42,7 +42,7 @@ class Scale(NamedTuple):
 
     @classmethod
     def parse(cls, text: str) -> Scale:
-        """Parse a size with its unit; VideoError if it is none.
+        """Parse a size with its unit; VideoError if it is invalid.
 
         >>> Scale.parse("0.05mm")
         Scale(size=0.05, unit='mm')
@@ -53,7 +53,7 @@ class Scale(NamedTuple):
         return cls(size, parts[2])
 
     def format(self, value: float, per: str = "") -> str:
-        """Format a length or a speed, rounded to a pixel."""
+        """Format a length or a speed, rounded to the size of a pixel."""
         digits = max(0, -math.floor(math.log10(self.size)))
         return "-" if math.isnan(value) else f"{value:.{digits}f} {self.unit}{per}"
 
@@ -63,12 +63,12 @@ _COLUMNS = ("frames", "present", "doubtful", "absent", "checked", "seconds", "di
 
 
 class _Object:
-    """The tracks of an object: from a frame to the next one, unless there is a gap, or it is absent in one of them.
+    """The tracks of an object in n frames.
 
-    frames   int (n,), their numbers in the source
+    frames   int (n,), frame numbers in the source
     times    float64 (n,), seconds
-    ends     float64 (n,), seconds: the time of the next frame; before a gap, after one interval
-    gaps     bool (n - 1,), whether the source was lost, or frames are missing, between a frame and the next one
+    ends     float64 (n,), seconds: time of the next frame; before a gap, one interval later
+    gaps     bool (n - 1,), whether frames are missing after a frame, because the source was lost or for another reason
     steps    float64 (n - 1,), distance from each centre of the box to the next one; NaN next to an absence or a gap
     states   present, doubtful or absent, (n,)
     """
@@ -89,13 +89,13 @@ class _Object:
         self._checked = float(np.mean([track.checked in ("keyframe", "checked") for track in tracks]))
 
     def runs(self) -> Iterator[tuple[str, slice]]:
-        """Yield the stretches of frames with one state and without a gap."""
+        """Yield each run of frames of one state without a gap."""
         cuts = np.flatnonzero((self.states[1:] != self.states[:-1]) | self.gaps) + 1
         for start, stop in pairwise([0, *cuts, len(self.states)]):
             yield str(self.states[start]), slice(start, stop)
 
     def row(self) -> list[float]:
-        """The values of `_COLUMNS`: shares from 0 to 1, NaN if unknown. Seconds are those in which it is present.
+        """The values of `_COLUMNS`, NaN if unknown: shares are from 0 to 1, seconds are the time of presence.
 
         The maximum speed is a mean over a quarter of a second, because boxes jitter from frame to frame.
         """
@@ -107,7 +107,7 @@ class _Object:
         return [len(self.states), *shares, self._checked, seconds, distance, mean, fastest]
 
     def lane(self, start: float, end: float) -> list[tuple[str, float, float, str]]:
-        """Its bars in a timeline between two times in seconds: state, left side and width in percent, and tooltip."""
+        """The bars of a timeline between two times in seconds: state, left edge and width in percent, and tooltip."""
         bars, scale = [], 100 / (end - start)
         for state, frames in self.runs():
             first, last = self.times[frames.start], self.ends[frames.stop - 1]
@@ -117,7 +117,7 @@ class _Object:
         return bars
 
     def speeds(self, seconds: float) -> tuple[Float64, Float64]:
-        """The middles of all stretches of these seconds, and the mean speed in each; NaN if a part of it is unknown."""
+        """Centres and mean speeds of a sliding window of this duration; NaN if part of a window is unknown."""
         if len(self.steps) < (window := max(1, round(seconds / self.interval))):
             return np.empty(0), np.empty(0)
         is_unknown = np.isnan(self.steps)
@@ -129,7 +129,7 @@ class _Object:
 
 
 class Section:
-    """The part of the report about a video, from a log with tracks; its attributes are the values of the template."""
+    """The section of a report about the log of a video; its attributes are the values of the template."""
 
     def __init__(self, log: Log, scale: Scale) -> None:
         self._log, self.name, self._header, self.unit = log, log.path.stem, log.header() or Header(), scale.unit
@@ -139,7 +139,7 @@ class Section:
                 tracks.setdefault((track.object, track.began), []).append(track)
         self.gap = self._log.gap
         self._labels, self._scale = dict[tuple[str, int], str](), scale
-        for (name, began), rows in tracks.items():  # another object that reuses a name has a label of its own
+        for (name, began), rows in tracks.items():  # a new object that reuses a name has its own label
             is_other = name in self._labels.values()
             self._labels[name, began] = f"{name}@{rows[0].source_frame}" if is_other else name
         rate = self._header.rate or RATE
@@ -155,14 +155,14 @@ class Section:
         self.pictures, self.problem = list[tuple[bytes, str]](), ""
 
     def add_pictures(self) -> None:
-        """Read the frames to look at from the source; note a problem if it cannot be read."""
+        """Draw pictures of doubtful frames; sets `problem` if the source cannot be read."""
         if not self._header.source or is_live(self._header.source):
             self.problem = "the log names no video"
-        elif frames := self._frames_to_look_at():
+        elif frames := self._doubtful_frames():
             numbered = ((frame.tracks[0].source_frame, frame.tracks) for frame in self._log)
             logged = {number: tracks for number, tracks in numbered if number in frames}
             first, rate = min(frames), self._header.rate or RATE
-            # A run skips damaged frames and scales others, or ends at the first: in any case these are its frames.
+            # With these settings, the frames are the same as the run's, which may have ended at a damaged one.
             settings = RunSettings(image_rate=rate, skip_damaged=True, resize=True)
             try:
                 part = slice(first, max(frames) + 1)
@@ -176,8 +176,8 @@ class Section:
             except VideoError as error:
                 self.problem = str(error)
 
-    def _frames_to_look_at(self) -> dict[int, str]:
-        """The middle of each of the longest doubtful stretches, and the reason."""
+    def _doubtful_frames(self) -> dict[int, str]:
+        """The middle frame of each of the longest doubtful runs, and its description."""
         runs = [
             (frames.stop - frames.start, int(item.frames[(frames.start + frames.stop) // 2]), name)
             for name, item in self._objects.items()
@@ -188,7 +188,7 @@ class Section:
         return {frame: f"{name or 'the object'}, {counted(count, 'doubtful frame')}" for count, frame, name in longest}
 
     def _speeds(self) -> tuple[dict[str, list[str]], float]:
-        """The polylines of the speed of each object in a plot of 1000 x 460, and the speed at its upper end."""
+        """The polylines of the speed of each object in a plot of 1000 x 460, and the speed at its upper edge."""
         duration = self.end - self.start
         speeds = {name: item.speeds(max(_SPEED_SECONDS, duration / _BINS)) for name, item in self._objects.items()}
         fastest = max(self._scale.size, *(np.fmax.reduce(values, initial=0) for _, values in speeds.values()))
@@ -204,7 +204,7 @@ class Section:
 
 
 def _texts(row: Sequence[float], scale: Scale) -> list[str]:
-    """The cells of a row of the page."""
+    """Format the cells of a row of the page."""
     frames, *shares, checked, seconds, distance, mean, fastest = row
     speeds = (scale.format(speed, "/s") for speed in (mean, fastest))
     texts = [f"{frames:.0f}", *(f"{share:.1%}" for share in shares), f"{checked:.1%}" if checked else "-"]
@@ -212,7 +212,7 @@ def _texts(row: Sequence[float], scale: Scale) -> list[str]:
 
 
 def write_report(path: Path, table: Path, sections: Sequence[Section]) -> None:
-    """Write the page of videos, and the table of their objects."""
+    """Write the page of the videos, and the CSV table of their objects."""
     write_page(path, "tracks.html", sections=sections)
     rows = (
         (section.name, label, *("" if math.isnan(value) else f"{value:.6g}" for value in row), section.unit)

@@ -1,11 +1,11 @@
-"""The log of tracks: NDJSON and CSV files that grow line by line, and all results of a run, which it continues.
+"""The log of tracks (NDJSON and CSV files that grow line by line), and the results files of a run.
 
-NDJSON is the log. CSV, SQLite and the annotated video follow it while the run goes on, and are made again from it when
-the run is resumed; only if a run writes no NDJSON, the database or the CSV file is its log.
+NDJSON is the log. CSV, SQLite and the annotated video are written during the run, and made again from the log when the
+run is resumed. If a run writes no NDJSON, its log is the database or the CSV file.
 
-A power cut or a full disk can cut a file within a frame of several objects. In each frame, the objects that were not in
-the frame before come first, so a last frame that has all objects of the frame before it is whole. Any other last frame
-counts as not written: it is cut, and tracked again.
+A power cut or a full disk can truncate a file within a frame of several objects. In each frame, objects that were not
+in the previous frame come first. Therefore the last frame is complete if it has all objects of the previous frame;
+otherwise it is removed and tracked again.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ from catstream.video.source import open_source
 from catstream.wire.codec import decode_json
 from catstream.wire.messages import Check, State, Track
 
-#: Stands for the objects of the frame before the first one: an object without a name is written last.
+#: The objects "before the first frame": the object without a name is written last.
 _FIRST = frozenset({UNNAMED})
 
 _COLUMNS = (
@@ -58,27 +58,27 @@ _COLUMNS = (
 )
 _OPTIONAL = {"source_frame", "checked", "probability", "processing"}
 
-_TIME = r"-\d{8}T\d{6}"  # in the name of a rotated file
+_TIME = r"-\d{8}T\d{6}"  # part of the name of a rotated file
 
 
 class LineSink(Sink):
-    """A file with a line for each track. Written lines remain if this process crashes.
+    """A file with a line for each track. Written lines survive a crash of this process.
 
-    An existing file is replaced, or continued after its first `origin.size` bytes. If it is removed, renamed or
-    truncated meanwhile, that is logged, and a file with a first line of its own continues. After an error, `write` may
-    be called again with the next frame: the file has no part of the frame before, and a header states the gap.
+    An existing file is replaced, or continued after its first `origin.size` bytes. If another program removes, renames
+    or truncates it, a warning is logged, and a new file with its own first line continues. After an error, `write` may
+    be called with the next frame: no part of the failed frame remains, and a header contains the size of the gap.
     """
 
     def __init__(self, dest: str, origin: Origin) -> None:
         self.path, self._origin = Path(dest), origin
-        self._before = _FIRST if origin.last is None else _objects(origin.last)
-        self._gap = origin.gap  # frames since the last one that was written
-        self._is_rotated = False  # since the last one
+        self._previous = _FIRST if origin.last is None else _objects(origin.last)  # objects of the previous frame
+        self._gap = origin.gap  # failed frames since the last written one
+        self._is_rotated = False  # since the last written frame
         self._open(origin.size)
 
     @abstractmethod
     def head_line(self, gap: int = 0) -> str:
-        """Return the first line of a file, or the one after a gap of some frames, without its end; empty for none."""
+        """Return the first line of a file, or the line after a `gap`, without its line end; empty for no line."""
 
     @abstractmethod
     def line(self, track: Track, seconds: float) -> str:
@@ -86,7 +86,7 @@ class LineSink(Sink):
 
     def write(self, frame: TrackedFrame) -> None:
         """Add the lines of a frame."""
-        tracks = sorted(frame.tracks, key=lambda track: track.object in self._before)
+        tracks = sorted(frame.tracks, key=lambda track: track.object in self._previous)
         lines = [self.line(track, frame.seconds) for track in tracks]
         try:
             self._follow()
@@ -97,30 +97,30 @@ class LineSink(Sink):
                 self._write(lines)
         except VideoError:
             self._gap += 1
-            with suppress(OSError, ValueError):  # it may be closed
+            with suppress(OSError, ValueError):  # the file may be closed
                 self._remove_part()
             raise
-        self._gap, self._is_rotated, self._before = 0, False, _objects(frame)
+        self._gap, self._is_rotated, self._previous = 0, False, _objects(frame)
         self._status = os.fstat(self._file.fileno())
 
     def must_rotate(self, now: float) -> bool:
-        """Return whether the file is too large, or its last row is of an earlier period."""
+        """Return True if the file is too large, or its last row is from an earlier period."""
         if (rotation := self._origin.options.rotate) is None:
             return False
         is_old = self._status.st_mtime // rotation.seconds < now // rotation.seconds
         return not self._is_rotated and (is_old or self._status.st_size > rotation.bytes)
 
     def rotate(self, now: float) -> None:
-        """Rename the file, and remove the oldest renamed ones; the next frame begins a new file."""
+        """Rename the file, and remove the oldest rotated ones; the next frame begins a new file."""
         keep, target = self._origin.options.keep, _with_time(self.path, now)
-        if target.exists() or not self.path.exists():  # from this second; removed by another program
+        if target.exists() or not self.path.exists():  # already rotated in this second, or removed by another program
             return
         with writing(self.path, VideoError):
             self.path.rename(target)
             self._is_rotated = True
             name = re.compile(rf"{re.escape(self.path.stem)}{_TIME}{self.path.suffix}")
-            renamed = sorted(file for file in self.path.parent.iterdir() if name.fullmatch(file.name))
-            for file in renamed[:-keep] if keep else ():
+            rotated = sorted(file for file in self.path.parent.iterdir() if name.fullmatch(file.name))
+            for file in rotated[:-keep] if keep else ():
                 file.unlink()
 
     def close(self) -> None:
@@ -129,19 +129,19 @@ class LineSink(Sink):
             self._file.close()
 
     def _write(self, lines: list[str]) -> None:
-        """Write without a buffer, which would keep what the disk did not take."""
+        """Write without a buffer, which would keep data after a failed write."""
         data = "".join(f"{line}\n" for line in lines).encode()
         while data:
             data = data[os.write(self._file.fileno(), data) :]
 
     def _remove_part(self) -> None:
-        """Remove the part of a frame that was written before an error."""
+        """Remove an incomplete frame after an error."""
         os.ftruncate(self._file.fileno(), self._status.st_size)
 
     def _open(self, size: int) -> None:
         self._file: IO[bytes] = open_locked(self.path, VideoError, size, mode="ab", buffering=0)
         with writing(self.path, VideoError), ExitStack() as stack:
-            if (first := self.head_line()) and not size:  # a file with no room for it is removed
+            if (first := self.head_line()) and not size:  # if it cannot be written, remove the file
                 stack.callback(self.path.unlink)
                 stack.enter_context(self._file)
                 self._write([first])
@@ -149,7 +149,7 @@ class LineSink(Sink):
         self._status = os.fstat(self._file.fileno())
 
     def _follow(self) -> None:
-        """Open a new file if another program has removed, renamed or truncated the file."""
+        """Reopen the file if another program has removed, renamed or truncated it."""
         rest, problem = 0, "removed or renamed"
         with writing(self.path, VideoError), suppress(FileNotFoundError, NotADirectoryError):
             status = self.path.stat()
@@ -158,13 +158,13 @@ class LineSink(Sink):
                     return
                 rest, problem = self.path.read_bytes().rfind(b"\n") + 1, "truncated"
         if not self._gap and not self._is_rotated:
-            Warnings(str(self.path)).log(f"{problem} by another program; the log goes on there without the rows before")
+            Warnings(str(self.path)).log(f"{problem} by another program; the log continues without the earlier rows")
         self._file.close()
         self._open(rest)
 
 
 class NdjsonSink(LineSink):
-    """After the header, a line of JSON for each track, as by `Track.to_dict`: a box is [x, y, w, h] or null."""
+    """A header, then a line of JSON for each track, with the fields of `Track.to_dict`."""
 
     def head_line(self, gap: int = 0) -> str:
         return replace(self._origin.header, gap=gap).to_json()
@@ -174,7 +174,7 @@ class NdjsonSink(LineSink):
 
 
 class StdoutSink(NdjsonSink):
-    """The tracks on standard output, without a header; each frame is seen at once."""
+    """NDJSON on standard output, without a header and unbuffered."""
 
     def __init__(self, _: str, origin: Origin) -> None:
         super().__init__("standard output", origin)
@@ -193,9 +193,9 @@ class StdoutSink(NdjsonSink):
 
 
 class CsvSink(LineSink):
-    """Tracks as rows of comma-separated values; `processing` is the time that the frame took, empty if not known.
+    """Comma-separated values; `processing` is the processing time of the frame, empty if unknown.
 
-    `checked` and `probability` are empty but for an annotation.
+    `checked` and `probability` are empty except in an annotation.
     """
 
     def head_line(self, gap: int = 0) -> str:
@@ -203,45 +203,45 @@ class CsvSink(LineSink):
 
     def line(self, track: Track, seconds: float) -> str:
         box = ",,," if track.box is None else ",".join(f"{side:.4f}" for side in track.box)
-        took = "" if isnan(seconds) else f"{seconds:.6f}"
+        processing = "" if isnan(seconds) else f"{seconds:.6f}"
         probability = "" if track.probability is None else f"{track.probability:.6f}"
         return (
             f"{track.frame},{track.time:.6f},{track.state},{box},{track.score:.6f},{track.model_version},{track.object},"
-            f"{track.source_frame},{track.checked},{probability},{took}"
+            f"{track.source_frame},{track.checked},{probability},{processing}"
         )
 
 
-#: The suffixes of all logs, in the order in which a run looks for the log to continue.
+#: The suffixes of all logs, in the order of preference for a resumed run.
 LOGS = (".ndjson", ".sqlite", ".csv")
 
 
 def is_log(path: Path) -> bool:
-    """Return whether a file of this name has all tracks of a run, and can be read and continued."""
+    """Return True if a file has a format from which a run can be resumed, by its name."""
     return path.suffix in LOGS
 
 
 class Log:
-    """A log, from which the tracks of a run are read. It may grow meanwhile.
+    """Reads the tracks of a run from its log, which may be growing.
 
-    A line that was cut at the end of the file counts as not written, and blank lines are ignored. VideoError, with its
-    number, for any other line that is no track; if `skip_damaged`, such lines are skipped.
+    A truncated last line and blank lines are ignored. Any other invalid line is a VideoError with its number, unless
+    `skip_damaged`.
 
-    damaged  number of lines that were skipped
-    gap      number of frames that the log states as missing
+    damaged  number of skipped lines
+    gap      number of missing frames, by the headers in the log
     """
 
     def __init__(self, path: Path, *, skip_damaged: bool = False) -> None:
         self.path, self.damaged, self.gap, self._skip = path, 0, 0, skip_damaged
 
     def header(self) -> Header | None:
-        """Read the header; None if there is none, as in a CSV file. VideoError if another version has written it."""
+        """Read the header; None without one, for example in a CSV file. VideoError if its version is unknown."""
         if self.path.suffix == ".sqlite":
             return read_database_header(self.path)
         with self.path.open("rb") as file:
             return Header.from_json(file.readline())
 
     def __iter__(self) -> Iterator[TrackedFrame]:
-        """Yield the frames in their order, in whichever order the rows are; none if there is no file.
+        """Yield the frames in order, even if the rows are not; nothing if the file does not exist.
 
         VideoError if an object has two rows in a frame.
         """
@@ -260,27 +260,27 @@ class Log:
             yield frame
 
     def last_whole_frame(self) -> tuple[TrackedFrame | None, int]:
-        """Return the last frame that is complete, None if there is none, and the byte at which it ends."""
+        """Return the last complete frame, or None, and the offset of its end in bytes."""
         last: tuple[TrackedFrame | None, int] = (None, 0)
         if self.path.suffix == ".sqlite":  # a frame is one transaction
             for frame in read_database(self.path):
                 last = frame, 0
             return last
-        before = last
+        previous = last
         for _, group in groupby((row for row in self._rows() if row[1]), lambda row: row[0].frame):
             rows = [*group]
-            before, last = last, (TrackedFrame([track for track, _ in rows]), rows[-1][1])
-        # The last frame is complete if it has all objects of the frame before it.
-        required = _FIRST if before[0] is None else _objects(before[0])
-        return last if last[0] is None or required <= _objects(last[0]) else before
+            previous, last = last, (TrackedFrame([track for track, _ in rows]), rows[-1][1])
+        # The last frame is complete if it has all objects of the previous frame.
+        required = _FIRST if previous[0] is None else _objects(previous[0])
+        return last if last[0] is None or required <= _objects(last[0]) else previous
 
     def _rows(self) -> Iterator[tuple[Track, int]]:
-        """Yield each track, and the byte at which its line ends; 0 without an end."""
+        """Yield each track, and the offset of the end of its line; 0 without a line end."""
         self.damaged = self.gap = 0
         if not self.path.exists():
             return
         with self.path.open("rb") as file:
-            if self.path.suffix == ".csv" and not file.readline().endswith(b"\n"):  # a crash has cut the names
+            if self.path.suffix == ".csv" and not file.readline().endswith(b"\n"):  # a crash has truncated the names
                 return
             file.seek(0)
             (start, parse), end = self._parser(), 0
@@ -292,11 +292,11 @@ class Log:
                     track = parse(line.decode("utf-8-sig"))
                 except ValueError as error:
                     header = Header.from_json(line)
-                    if header is not None:  # the first line of a log, a gap, an appended log
+                    if header is not None:  # at the start of a log, after a gap, or of an appended log
                         self.gap += header.gap
-                    elif line.endswith(b"\n"):  # else a crash has cut the file
+                    elif line.endswith(b"\n"):  # otherwise a crash has truncated the file
                         if not self._skip:
-                            problem = f"{self.path}, line {number} is no track ({error})"
+                            problem = f"{self.path}, line {number} is not a track ({error})"
                             raise VideoError(f"{problem}: pass --skip-damaged to continue after it") from None
                         self.damaged += 1
                     continue
@@ -304,9 +304,9 @@ class Log:
                     yield track, end if line.endswith(b"\n") else 0
 
     def _parser(self) -> tuple[int, Callable[[str], Track | None]]:
-        """Return the number of lines before the first track, and the function that parses a line: None if it is empty.
+        """Return the number of lines before the first track, and a parser for lines, which returns None for empty ones.
 
-        VideoError if the names of the columns of a CSV file are wrong.
+        VideoError if the columns of a CSV file are wrong.
         """
         if self.path.suffix != ".csv":
             return 0, lambda line: decode_json(line.encode(), Track)
@@ -321,21 +321,21 @@ class Log:
 
 
 def _with_time(path: Path, seconds: float) -> Path:
-    """Return the name of a file that is renamed: the names sort by the time, in UTC, and before the newest one."""
+    """Return the name of a rotated file, with a time in UTC: names sort by time, and before the current file."""
     return path.with_stem(f"{path.stem}-{datetime.fromtimestamp(seconds, UTC):%Y%m%dT%H%M%S}")
 
 
 def logs_of(files: Iterable[Path], *, skip_damaged: bool = False) -> list[Log]:
-    """Return logs, and the NDJSON logs of folders; VideoError if one is no log, or contains no tracks."""
+    """Return the logs of files, and the NDJSON logs of folders; VideoError if one is invalid or without tracks."""
     paths: list[Path] = []
     for path in files:
-        found = sorted(path.glob("*.ndjson")) if path.is_dir() else [path]
-        if not found:
+        candidates = sorted(path.glob("*.ndjson")) if path.is_dir() else [path]
+        if not candidates:
             raise VideoError(f"{path} contains no .ndjson file: pass the output folder of a run or a batch")
-        if not is_log(found[0]) or not found[0].is_file():
+        if not is_log(candidates[0]) or not candidates[0].is_file():
             problem = "is not the log of a run" if path.exists() else "does not exist"
             raise VideoError(f"{path} {problem}: pass one of a run's files, {', '.join(LOGS)}")
-        paths += found
+        paths += candidates
     logs = [Log(path, skip_damaged=skip_damaged) for path in paths]
     for log in logs:
         if next(iter(log), None) is None:
@@ -344,7 +344,7 @@ def logs_of(files: Iterable[Path], *, skip_damaged: bool = False) -> list[Log]:
 
 
 def join_rotated(logs: Iterable[Log]) -> list[Log]:
-    """Join the rotated files of each run, whose names differ in the time."""
+    """Join the rotated files of each run, whose names differ only in the time."""
     runs: dict[str, list[Log]] = {}
     for log in sorted(logs, key=lambda log: log.path.name):
         runs.setdefault(re.sub(_TIME, "", log.path.name), []).append(log)
@@ -352,12 +352,12 @@ def join_rotated(logs: Iterable[Log]) -> list[Log]:
 
 
 class JoinedLog(Log):
-    """The rotated files of one run, read as one log. VideoError if they are of several sources, or repeat a frame."""
+    """The rotated files of one run as one log. VideoError if they have several sources or repeat a frame."""
 
     def __init__(self, logs: Iterable[Log]) -> None:
         self._logs = sorted(logs, key=lambda log: next(iter(log)).number)
         if len({(log.header() or Header()).source for log in self._logs}) > 1:
-            raise VideoError("the logs are of several sources: pass the files of one run, or --format yolo")
+            raise VideoError("the logs have different sources: pass the files of one run, or --format yolo")
         super().__init__(self._logs[-1].path)
 
     def __iter__(self) -> Iterator[TrackedFrame]:
@@ -373,10 +373,7 @@ class JoinedLog(Log):
 
 
 def _parse_row(row: Row) -> Track:
-    """The track of a row of a CSV file; raise ValueError if it is none.
-
-    It has no `pts`, `began` and `doubtful`, which are not in the file.
-    """
+    """Parse a row of a CSV file, which lacks `pts`, `began` and `doubtful`; ValueError if it is invalid."""
     box = Box(*(row.number(side) for side in "xywh")) if row.text("x") else None
     return Track(
         *(row.integer("frame"), row.number("seconds"), row.choice("state", get_args(State)), box, row.number("score")),
@@ -393,7 +390,7 @@ def _objects(frame: TrackedFrame) -> frozenset[str]:
 
 
 def destinations_of(name: str, results: Results) -> list[str]:
-    """Return the destinations of a run of this name, each once: the log in both forms, the video, and further ones."""
+    """Return the unique destinations of a run: NDJSON, CSV and video named `name`, and further ones."""
     kinds = ("ndjson", "csv", *(["mp4"] if results.video else []))
     own = [] if results.output is None else [str(results.output / f"{name}.{kind}") for kind in kinds]
     return [*dict.fromkeys([*own, *map(str, results.write or ())])]
@@ -403,12 +400,12 @@ def destinations_of(name: str, results: Results) -> list[str]:
 class RunFiles:
     """All destinations of a run.
 
-    A resumed run continues after the last whole frame of its log: the NDJSON file, or without one the database or the
-    CSV file. The other files are made again from the log.
+    A resumed run continues after the last complete frame of its log: the NDJSON file or, without one, the database or
+    the CSV file. The other files are made again from the log.
 
-    origin  the source of the run, and the frames that are tracked
-    output  folder of the results, which is made if it does not exist; None for none
-    destinations  the destinations, each once
+    origin  the run whose tracks are written
+    output  folder of the results, created if it does not exist, or None
+    destinations  the unique destinations
     """
 
     origin: Origin
@@ -416,10 +413,10 @@ class RunFiles:
     destinations: list[str]
 
     def check(self, *, overwrite: bool, earlier: list[str], others: Mapping[str, Path] | None = None) -> None:
-        """Raise VideoError before the run if a destination cannot be written, or must not be.
+        """Raise VideoError before the run if a destination cannot be written or must not be overwritten.
 
-        If `overwrite`, existing files may be replaced; files of an `earlier` part of this run are continued. All files,
-        also the `others` that the run writes, by their purpose, have to be different.
+        If `overwrite`, existing files may be replaced; files of an `earlier` part of this run are continued. All files
+        must be different, including `others` that the run writes, by their purpose.
         """
         source = self.origin.header.source
         files = [(f"the destination {dest}", Path(dest)) for dest in self.destinations if is_file(dest)]
@@ -433,9 +430,9 @@ class RunFiles:
                 check_result(Path(dest), overwrite=overwrite or continued, source=source, made=self.output)
 
     def position(self, *, skip_damaged: bool = False) -> tuple[int | None, float]:
-        """Return the number of the frame after the last whole one of the log, and the seconds of that one.
+        """Return the number of the first frame to track, after the last complete one in the log, and the latter's time.
 
-        None and 0 if there is to be no log; VideoError if it is damaged, unless damaged lines are skipped.
+        None and 0 if the run has no log. VideoError if the log is damaged, unless `skip_damaged`.
         """
         if (path := self._log()) is None:
             return None, 0.0
@@ -443,11 +440,11 @@ class RunFiles:
         return (0, 0.0) if last is None else (last.number + 1, last.tracks[0].time)
 
     def missing(self) -> list[str]:
-        """Return the files that do not exist, as another program has removed them."""
+        """Return the files that do not exist, because another program has removed them."""
         return [dest for dest in self.destinations if is_file(dest) and not Path(dest).exists()]
 
     def is_complete(self, frames: int | None) -> bool:
-        """Return whether all destinations, at least one, are files that have this number of frames, None if unknown."""
+        """Return True if there are destinations, all files with this number of `frames` (None if unknown)."""
 
         def count(dest: str) -> int | None:
             if is_log(Path(dest)):
@@ -460,12 +457,12 @@ class RunFiles:
         return frames is not None and {*map(count, self.destinations)} == {frames}
 
     def opened(self, endpoint: str, *, resume: bool = False, skip_damaged: bool = False) -> OpenFiles:
-        """Open all destinations beside a pipeline; existing files are replaced.
+        """Open all destinations for a pipeline at an endpoint; existing files are replaced, or continued if `resume`.
 
-        If `resume`, they continue after `position`. VideoError if that is not possible.
+        VideoError if this fails.
         """
         origin = replace(self.origin, address=replace(self.origin.address, endpoint=endpoint))
-        path = self._log() if resume else None  # before new ones exist
+        path = self._log() if resume else None  # before new files exist
         log = None if path is None else Log(path, skip_damaged=skip_damaged)
         last, size = (None, 0) if log is None else log.last_whole_frame()
         log_origin = replace(origin, last=last, size=size)
@@ -483,9 +480,9 @@ class RunFiles:
         return outputs
 
     def continued(self, endpoint: str, *, resume: bool) -> OpenFiles:
-        """The same for an unattended run: a file that is not continued is renamed, and folders are created.
+        """Open all destinations for an unattended run: creates folders, and renames files that are not continued.
 
-        walk.ndjson becomes walk-20261128T133015.ndjson, by the time of its last change.
+        walk.ndjson is renamed to walk-20261128T133015.ndjson, by the time of its last change.
         """
         for dest in map(Path, filter(is_file, self.destinations)):
             with writing(dest, VideoError):
@@ -496,20 +493,20 @@ class RunFiles:
         return self.opened(endpoint, resume=resume)
 
     def _log(self) -> Path | None:
-        """Return the log that is continued, None if there is to be none."""
+        """Return the log from which the run is resumed, existing or not; None without a log."""
         logs = (Path(dest) for dest in self.destinations if is_log(Path(dest)))
         return min(logs, key=lambda log: (not log.exists(), LOGS.index(log.suffix)), default=None)
 
 
 class OpenFiles(AbstractContextManager["OpenFiles"]):
-    """All destinations of a run while it continues; each is opened by its first `write_to`.
+    """The open destinations of a run; each is opened by its first `write_to`.
 
     VideoError if one cannot be opened, written or completed.
 
-    If the source `is_live`, the run continues instead: a frame that cannot be written is counted, and a destination
-    that could not be opened is tried again with each frame.
+    If the source `is_live`, the run continues instead: a frame that cannot be written is counted, and opening a
+    destination is retried with each frame.
 
-    not_written  frames that at least one destination lacks, as it could not be written
+    not_written  number of frames that could not be written to all destinations
     """
 
     def __init__(self, origins: Mapping[str, Origin], *, is_live: bool) -> None:
@@ -519,16 +516,16 @@ class OpenFiles(AbstractContextManager["OpenFiles"]):
 
     @property
     def missed(self) -> int:
-        """Frames that could not be written everywhere, and messages that a destination on the network has missed."""
+        """Frames that could not be written to all destinations, plus frames and messages that sinks missed."""
         return self.not_written + sum(sink.missed for sink in self._sinks.values())
 
     @property
     def trouble(self) -> str:
-        """Why frames could not be written; empty once all were written for some seconds."""
+        """Current write errors; empty once all frames were written for some seconds."""
         return "; ".join(self._warnings.problems)
 
     def write(self, frame: TrackedFrame) -> None:
-        """Write a frame everywhere."""
+        """Write a frame to all destinations."""
         if self._is_live:
             self._rotate()
         written = [self.write_to(dest, frame) for dest in self._origins]
@@ -538,7 +535,7 @@ class OpenFiles(AbstractContextManager["OpenFiles"]):
             self.not_written += 1
 
     def write_to(self, dest: str, frame: TrackedFrame | None = None) -> bool:
-        """Open a destination if it is not open, and write a frame to it; return whether that was possible."""
+        """Open a destination if necessary, and write a frame to it; returns False if this fails for a live source."""
         try:
             if dest not in self._sinks:
                 sink = open_sink(dest, replace(self._origins[dest], gap=self.not_written))
@@ -553,7 +550,7 @@ class OpenFiles(AbstractContextManager["OpenFiles"]):
         return True
 
     def _rotate(self) -> None:
-        """Rotate all logs at the same frame: a resumed run makes them again from the newest one."""
+        """Rotate all logs at the same frame, because a resumed run makes the others again from the newest one."""
         sinks, now = self._sinks.values(), time.time()
         logs = [sink for sink in sinks if isinstance(sink, LineSink) and not isinstance(sink, StdoutSink)]
         if any(log.must_rotate(now) for log in logs):
@@ -564,12 +561,12 @@ class OpenFiles(AbstractContextManager["OpenFiles"]):
                     self._warnings.failed(str(error))
 
     def idle(self) -> None:
-        """Tell the destinations that no frame has arrived for a while."""
+        """Let the destinations do periodic work while no frame arrives."""
         for sink in self._sinks.values():
             sink.idle()
 
     def end(self) -> None:
-        """Tell the destinations that no frame follows, before one of them waits for its delivery."""
+        """End all destinations before `close` waits for the delivery to one of them."""
         for sink in self._sinks.values():
             sink.end()
 

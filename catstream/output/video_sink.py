@@ -1,4 +1,4 @@
-"""The video with its tracks drawn in, from the frames of a source, or from the pictures of a running pipeline."""
+"""Annotated videos: from the frames of a source, or from the previews of a running pipeline."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from catstream.video.source import open_source
 from catstream.video.writer import VideoWriter
 from catstream.wire.messages import Preview, Track
 
-_BACKLOG = 256  # frames whose tracks wait for their picture
+_BACKLOG = 256  # maximum number of frames whose tracks wait for a preview
 
 
 def open_video(dest: str, origin: Origin) -> Sink:
-    """Open an MP4 of the frames of a source if they can be read a second time, else of the pipeline's pictures."""
+    """Open an MP4 of the frames of a source if they can be read a second time, otherwise of the previews."""
     return PictureVideo(dest, origin) if origin.attached else SourceVideo(dest, origin.header)
 
 
 class SourceVideo(Sink):
-    """An MP4 of the frames that have a track, with their tracks drawn in."""
+    """Draws tracks in the frames of the source, and writes them to an MP4."""
 
     def __init__(self, dest: str, header: Header) -> None:
-        # The pipeline skips damaged frames and scales others, or ends at the first: in any case these are its frames.
+        # With these settings, the frames are the same as the run's, which may have ended at a damaged one.
         part = slice(header.start, None, header.stride)
         self._frames = open_source(
             header.source, part=part, image_rate=header.rate or RATE, skip_damaged=True, resize=True
@@ -51,17 +51,17 @@ class SourceVideo(Sink):
 
 
 class PictureVideo(Sink):
-    """An MP4 of the small pictures that a running pipeline sends, with their tracks drawn in, at their true times."""
+    """Draws tracks in the previews of a running pipeline, and writes them to an MP4, at their true times."""
 
     def __init__(self, dest: str, origin: Origin) -> None:
         self._dest, self._colours = dest, Colours()
         self._previews = subscribe(origin.address, "previews", timeout=0)
-        self._tracks: dict[int, list[Track]] = {}  # of the newest frames, by the number of the frame
-        self._picture: Preview | None = None  # not drawn yet: its frame may have further tracks
+        self._tracks: dict[int, list[Track]] = {}  # of the newest frames, by frame number
+        self._picture: Preview | None = None  # waits for further tracks of its frame
         self._video: VideoWriter | None = None
 
     def write(self, frame: TrackedFrame) -> None:
-        """Add tracks, and the next picture whose frame has all its tracks."""
+        """Add tracks, and draw the next preview once all tracks of its frame have arrived."""
         self._tracks.setdefault(frame.number, []).extend(frame.tracks)
         if len(self._tracks) > _BACKLOG:
             del self._tracks[next(iter(self._tracks))]

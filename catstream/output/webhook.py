@@ -1,8 +1,8 @@
-"""A webhook: each event as JSON, by POST to an address of the user's.
+"""A webhook: posts each event as JSON to a URL.
 
-`EventStream.to_json` makes the body. With a key, the header `X-Catstream-Signature` is `sha256=` and the HMAC-SHA256 of
-the body in hexadecimal digits. After an answer 408, 425, 429 or 5xx, or none, an event is sent again with the same
-`id`, not before `Retry-After`, and the events behind it wait. Any other answer but 2xx refuses it.
+The body is from `EventStream.to_json`. With a key, the header `X-Catstream-Signature` is `sha256=` and the HMAC-SHA256
+of the body in hexadecimal digits. After status 408, 425, 429 or 5xx, or without a response, the event is sent again
+with the same `id`, not before `Retry-After`, while later events wait. After any other status than 2xx, it is dropped.
 """
 
 from __future__ import annotations
@@ -27,16 +27,16 @@ from catstream.output.remote import CLOSE_SECONDS, QUEUED, EventStream, Warnings
 from catstream.wire.messages import Preview
 
 _FORM = "https://[USER:PASSWORD@]HOST[:PORT]/PATH"
-_TIMEOUT = 10.0  # seconds for a connection, and for an answer
-_PAUSE, _LONGEST_PAUSE = 1.0, 60.0  # seconds before an event is sent again, doubled each time
-_LONGEST_RETRY_AFTER = 600.0  # seconds that a receiver may ask to wait
-_AGAIN = {0, 408, 425, 429, *range(500, 600)}  # answers after which it is; 0 for none
+_TIMEOUT = 10.0  # seconds for a connection, and for a response
+_PAUSE, _LONGEST_PAUSE = 1.0, 60.0  # exponential backoff in seconds: first and longest pause before a retry
+_LONGEST_RETRY_AFTER = 600.0  # maximum accepted Retry-After in seconds
+_AGAIN = {0, 408, 425, 429, *range(500, 600)}  # status codes that are retried; 0 for no response
 
 
 class Webhook(Sink):
-    """Posts the events from a thread of its own; if `QUEUED` of them wait, further ones are missed.
+    """Posts the events from a background thread; if `QUEUED` events wait, further ones are dropped.
 
-    missed  events that were dropped, because too many waited; once it is closed, all that were not delivered
+    missed  number of dropped events; after `close`, of all events that were not delivered
     """
 
     def __init__(self, dest: str, origin: Origin) -> None:
@@ -44,15 +44,15 @@ class Webhook(Sink):
         self._events, self._warnings = EventStream(origin, has_pictures=origin.options.picture), Warnings(dest)
         self._bodies: SimpleQueue[bytes | None] = SimpleQueue()
         self._count = self._delivered = self.missed = 0
-        self._hurry, self._closed = Flag(), False  # the event ends a pause
-        self._deadline: float | None = None  # of the delivery, once the sink has ended
-        self._retry_after, self._is_working = 0.0, False  # what the last answer says
+        self._hurry, self._closed = Flag(), False  # `_hurry` interrupts a pause
+        self._deadline: float | None = None  # for the delivery, once the sink has ended
+        self._retry_after, self._is_working = 0.0, False  # by the last response
         self._thread = Thread(target=self._deliver_all, name="webhook", daemon=True)
         self._thread.start()
 
     @staticmethod
     def check(dest: str, options: SinkOptions) -> None:
-        """Raise VideoError if this is no address, or the key cannot be read."""
+        """Raise VideoError if the address is invalid or the key cannot be read."""
         split(dest, _FORM)
         _key(options)
 
@@ -63,11 +63,11 @@ class Webhook(Sink):
         self._queue(self._events.update(frame.tracks))
 
     def idle(self) -> None:
-        """Queue the events that have waited for a picture."""
+        """Queue the events that no longer wait for a picture."""
         self._queue(self._events.update())
 
     def end(self) -> float:
-        """Queue the last events; return the time until which the backlog is delivered."""
+        """Queue the last events; return the deadline for the delivery of the backlog."""
         if self._deadline is None:
             self._deadline = time.monotonic() + CLOSE_SECONDS
             self._queue(self._events.close())
@@ -76,7 +76,7 @@ class Webhook(Sink):
         return self._deadline
 
     def close(self) -> None:
-        """Deliver the backlog for some seconds after the end, and warn about missed events."""
+        """Wait for the delivery of the backlog until the deadline, and warn about missed events."""
         self._thread.join(max(0.0, self.end() - time.monotonic()))
         self._closed = True
         self._hurry.set()
@@ -93,7 +93,7 @@ class Webhook(Sink):
                 self.missed += 1
 
     def _deliver_all(self) -> None:
-        """Deliver in order, until all has arrived or the sink is closed."""
+        """Deliver the events in order, until all were delivered or the sink is closed."""
         for body in iter(self._bodies.get, None):
             pause = _PAUSE
             while (status := self._post(body)) in _AGAIN:
@@ -105,7 +105,7 @@ class Webhook(Sink):
             self._delivered += status // 100 == 2
 
     def _post(self, body: bytes) -> int:
-        """Post an event; return the status of the answer, 0 for none."""
+        """Post an event; return the status of the response, 0 without a response."""
         url, headers = self._url, {"Content-Type": "application/json", "User-Agent": "catstream"}
         if url.username is not None:
             user = f"{unquote(url.username)}:{unquote(url.password or '')}"
@@ -117,8 +117,8 @@ class Webhook(Sink):
         status, problem = 0, ""
         try:
             connection.request("POST", urlunsplit(("", "", url.path or "/", url.query, "")), body, headers)
-            answer = connection.getresponse()
-            status, self._retry_after = answer.status, _seconds(answer.getheader("Retry-After", ""))
+            response = connection.getresponse()
+            status, self._retry_after = response.status, _seconds(response.getheader("Retry-After", ""))
             if status // 100 != 2:
                 problem = f"answered {status} {responses.get(status, '')}"
         except OSError as error:
@@ -135,7 +135,7 @@ class Webhook(Sink):
 
 
 def _seconds(retry_after: str) -> float:
-    """Return the seconds that a header `Retry-After` states, as a number or a date; 0 if it is not valid.
+    """Parse a header `Retry-After`, a number of seconds or a date, to seconds from now; 0 if it is invalid.
 
     >>> _seconds("120"), _seconds("Fri, 31 Dec 9999 23:59:59 GMT"), _seconds("soon")
     (120.0, 600.0, 0.0)
@@ -148,7 +148,7 @@ def _seconds(retry_after: str) -> float:
 
 
 def _key(options: SinkOptions) -> bytes:
-    """Return the key; empty to sign nothing."""
+    """Return the key for signatures; empty without one."""
     if options.secret_file is None:
         return b""
     try:
