@@ -1,9 +1,9 @@
 """The web application of `catstream annotate`: a page that shows the session of a video, and changes its boxes.
 
 /                the page
-/events          the state of the session, and what changes in it, as server-sent events, at most ten per second
+/events          the state of the session and its changes, as server-sent events, at most ten per second
 /frames/N.jpg    the picture of a frame, scaled down if it is large; /frames/N.jpg?full has all pixels
-/frames/N        its size, and what the passes say about the objects in it; both have ?video=N, by default 0
+/frames/N        its size, and the boxes and proposals of the objects in it; both have ?video=N, by default 0
 /edit            POST a change: the fields of `Edit`
 """
 
@@ -34,16 +34,16 @@ from catstream.video.drawing import PALETTE
 from catstream.video.frames import describe_counters, jpeg
 from catstream.web.app import PAGE, UPDATE_SECONDS, endless, event, failed, json_of
 
-_PARTS = 2000  #: of a timeline, which is not wider in pixels
-_SIDE = 1920  #: longest side of a picture in pixels; a larger frame is scaled down
+_PARTS = 2000  #: maximum number of parts of a timeline, about its width in pixels
+_SIDE = 1920  #: longest side of a picture in pixels, to which larger frames are scaled down
 
 
 class AnnotationSite:
-    """The web application of the open one of several sessions, `app`, without access control; `Server` serves it."""
+    """The web application of the open session, `app`, without access control; `Server` serves it."""
 
     def __init__(self, sessions: Sessions) -> None:
         self._sessions, self._closed = sessions, False
-        self._id = token_hex(8)  # a tab of an earlier server at the same port has another one
+        self._id = token_hex(8)  # distinguishes this server from an earlier one at the same port
         routes = [
             Route("/", lambda _: FileResponse(PAGE / "annotate.html")),
             Route("/events", lambda request: endless(request, self._states(), "text/event-stream")),
@@ -67,7 +67,7 @@ class AnnotationSite:
         return Response(jpeg(image, None if is_full else _SIDE, 95 if is_full else 90), media_type="image/jpeg")
 
     def _frame(self, request: Request) -> Response:
-        """The size of a frame, the box of each object in it, and the proposals if it is unchecked."""
+        """The size of a frame, the box of each object in it, and the proposals if the box is unchecked."""
         number, session = self._number(request), self._session
         objects = {}
         with session.lock:
@@ -118,7 +118,7 @@ class AnnotationSite:
         return {}
 
     async def _states(self) -> AsyncIterator[str]:
-        """Yield the state, and then the values that have changed, as server-sent events."""
+        """Yield the state, and then changed values, as server-sent events."""
         shown: dict[str, object] = {}
         while not self._closed:
             state = await run_in_threadpool(self._state)
@@ -149,16 +149,15 @@ class AnnotationSite:
 
 @dataclass(frozen=True, slots=True)
 class Edit:
-    """A change of the page.
+    """A change by the page.
 
     server  id of the server, from the state of the page
-    video   number of the video, which is open; or "open" opens it
-    verb    "draw" a box at a frame, none if the object is absent; "delete" it; "undo" the last change; "rename" an
-            object; "done"
+    video   number of the open video, or of the video for "open"
+    verb    "draw" a box at a frame; "delete" it; "undo" the last change; "rename" an object; "open" a video; "done"
     object  name of the object
-    frame   number of the frame; none deletes the object
-    box     x, y, w, h in pixels, or "hidden"
-    name    the new name
+    frame   number of the frame; None deletes the object
+    box     x, y, w, h in pixels; "hidden"; or None if the object is absent
+    name    new name
     """
 
     server: str
@@ -171,7 +170,7 @@ class Edit:
 
 
 def _described(session: Session) -> list[dict[str, object]]:
-    """The objects with their keyframes, the number of unchecked frames, and where these are."""
+    """The objects with their keyframes, and the number and ranges of unchecked frames."""
     objects: list[dict[str, object]] = []
     for name, drawn in session.annotation.keyframes.items():
         unchecked = np.ones(len(session.annotation.frames), bool)
@@ -194,7 +193,7 @@ def _rounded(box: Box | None) -> list[float] | None:
 
 
 def _runs(mask: Bool) -> list[tuple[int, int]]:
-    """The first and the last number of neighbouring frames with True, in a long video rounded to parts of it."""
+    """The first and the last frame of each run of True, rounded to parts of the timeline in a long video."""
     part = -(-len(mask) // _PARTS) or 1
     parts = np.pad(mask, (0, -len(mask) % part)).reshape(-1, part).any(axis=1)
     edges = np.flatnonzero(np.diff(np.pad(parts, 1)))

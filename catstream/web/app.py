@@ -41,13 +41,13 @@ _Kind = TypeVar("_Kind")
 
 PAGE = Path(__file__).with_name("page")
 
-UPDATE_SECONDS = 0.1  #: between two updates
-COMMENT_SECONDS = 5.0  #: without an update, after which a comment is sent, which detects closed connections
-RETRY_SECONDS = 1.0  #: after which a page whose connection broke connects again
+UPDATE_SECONDS = 0.1  #: interval between two updates
+COMMENT_SECONDS = 5.0  #: time without an update after which a comment is sent, to detect closed connections
+RETRY_SECONDS = 1.0  #: delay before a page reconnects
 _MAX_BODY = 4096  # bytes
 _MJPEG = "multipart/x-mixed-replace; boundary=picture"
 
-#: Status code of the answer to a request that ends with an error, by the first class that fits.
+#: Status codes of errors; the first matching class applies.
 _CODES = {
     CommandRejectedError: 409,
     ProtocolError: 400,
@@ -113,7 +113,7 @@ class Site:
         command = await json_of(request, Command)
         try:
             answer = await run_in_threadpool(self.feed.execute, **asdict(command))
-        except asyncio.CancelledError:  # by the server, which waits for its shutdown no longer
+        except asyncio.CancelledError:  # by the server, after the timeout of its shutdown
             raise HTTPException(503, "the server of this page has ended\n") from None
         result = {"reason": answer.reason, "frame": answer.frame, "version": answer.version, "object": answer.object}
         return JSONResponse({"done": True} | result)
@@ -143,14 +143,14 @@ class Site:
                 if newest is not None and newest != last:
                     last = newest
                     jpeg = await run_in_threadpool(draw_preview, *newest, dashboard.colours)
-                    # The boundary after the picture is sent with it: many clients show a picture only after it.
-                    head = b"Content-Type: image/jpeg\r\nContent-Length: %d\r\n\r\n" % len(jpeg)
-                    yield head + jpeg + b"\r\n--picture\r\n"
+                    # Send the next boundary with the picture, because many clients show a picture only after it.
+                    header = b"Content-Type: image/jpeg\r\nContent-Length: %d\r\n\r\n" % len(jpeg)
+                    yield header + jpeg + b"\r\n--picture\r\n"
                 await asyncio.sleep(UPDATE_SECONDS)
 
 
 async def json_of(request: Request, kind: type[_Kind]) -> _Kind:
-    """The message in the body of a request; ProtocolError if it is too long or not valid."""
+    """Decode the body of a request; ProtocolError if it is too long or invalid."""
     # A page of another origin cannot send this content type without a CORS preflight request.
     if request.headers.get("content-type", "").partition(";")[0].strip() != "application/json":
         raise HTTPException(415, "expected application/json\n")
@@ -162,7 +162,7 @@ async def json_of(request: Request, kind: type[_Kind]) -> _Kind:
 
 
 def endless(request: Request, parts: AsyncIterator[str] | AsyncIterator[bytes], media_type: str) -> Response:
-    """Return the response to a request, which ends only for a HEAD request: its response has no parts."""
+    """Return a streaming response; the response to a HEAD request has no parts."""
     return StreamingResponse(iter(()) if request.method == "HEAD" else parts, media_type=media_type)
 
 
@@ -172,7 +172,7 @@ def event(parts: dict[str, object]) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """A command of the page: the fields of `catstream.wire.messages.Command` that it may set."""
+    """A command from the page: the fields of `catstream.wire.messages.Command` that it may set."""
 
     verb: Literal["set-box", "forget", "pause", "resume", "stop"]
     object: str = ""

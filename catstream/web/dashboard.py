@@ -1,4 +1,4 @@
-"""The state of the page of a pipeline, computed from its messages. It uses no socket and no clock."""
+"""The state of the page of a pipeline, computed from its messages, without sockets and without a clock."""
 
 from __future__ import annotations
 
@@ -17,29 +17,29 @@ Value = TypeVar("Value")
 #: Phase of a pipeline: no message yet, running, silent for some seconds, ended.
 Phase = Literal["waiting", "running", "silent", "ended"]
 
-POINT_SECONDS = 0.25  #: between two points of the charts
-RATE_SECONDS = 2.0  #: over which frames per second are counted
+POINT_SECONDS = 0.25  #: interval between two points of the charts
+RATE_SECONDS = 2.0  #: window for the frame rate
 _POINTS = 480  # two minutes
-_FRAMES = 4096  # number of frames whose arrival times are kept, for the latency of models
-_TRACKS = 256  # number of frames whose tracks are kept until their picture arrives
-_PICTURES = 64  # number of pictures that a page with a slow connection may still request
+_FRAMES = 4096  # number of stored arrival times of frames, for the latency of models
+_TRACKS = 256  # number of frames whose tracks are stored until their picture arrives
+_PICTURES = 64  # number of stored pictures, for pages with a slow connection
 _SHOWN_OF_A_PICTURE = ("frame", "time", "width", "height", "boxes")
 
-#: A point of the charts: time, frames per second, and of each object its score, model latency, model version, and
-#: whether it is present.
+#: A point of the charts: time, frames per second, and for each object its score, model latency, model version and
+#: presence.
 _Point = tuple[float, float, dict[str, tuple[float, float | None, int, bool]]]
 
 
 @dataclass(slots=True)
 class TrackedObject:
-    """One of the objects that a pipeline tracks.
+    """A tracked object.
 
     colour         colour of its box, #rrggbb
-    state, score   from its newest track
-    version        version of the model that scored it
+    state, score   of its newest track
+    version        model version of its newest track
     began          number of its first frame, None before its first track
     seq            number of its newest track, 0 before the first
-    trained        version of its newest model that has arrived
+    trained        version of its newest received model
     model_latency  seconds from the track of a frame to the model that was trained on it, None before the first model
     """
 
@@ -56,40 +56,39 @@ class TrackedObject:
 class Dashboard:
     """Receives messages, and returns the parts of the page that have changed.
 
-    It shows one pipeline. It keeps the last picture and figures until the first message of another pipeline arrives;
-    then it drops all state of the previous one.
+    It shows one pipeline. The last picture and figures remain until the first message of another pipeline resets the
+    state.
     """
 
     def __init__(self) -> None:
         self.endpoint = self._attached = ""
-        self._run = ""  # id of the run that is shown
-        self._runs_before: set[str] = set()  # ids of those before it, whose last messages may still arrive
+        self._run = ""  # id of the present run
+        self._earlier_runs: set[str] = set()  # ids of runs whose last messages may still arrive
         self._reset()
 
     def _reset(self) -> None:
         """Drop all state of the previous pipeline."""
         self.phase: Phase = "waiting"
-        self.reason = ""  #: of the end or the silence
+        self.reason = ""  #: reason of the end or of the silence
         self.source = ""
-        self.objects: dict[str, TrackedObject] = {}  #: in the order in which they began
+        self.objects: dict[str, TrackedObject] = {}  #: by name, in order of their beginning
         self.colours = Colours()
-        self.health: dict[str, Health] = {}  #: the last report of each process
-        self.last_reports: dict[str, float] = {}  #: times of their arrivals
-        self._pictures: dict[float, Preview] = {}  # by time: skipped frames of a live source have the same number
+        self.health: dict[str, Health] = {}  #: last report of each process
+        self.last_reports: dict[str, float] = {}  #: arrival times of these reports
+        self._pictures: dict[float, Preview] = {}  # by time, because skipped frames of a live source share a number
         self._points: deque[_Point] = deque(maxlen=_POINTS)
-        self._arrivals: dict[int, float] = {}  # of the first track of each frame
+        self._arrivals: dict[int, float] = {}  # arrival time of the first track of each frame
         self._tracks: dict[int, dict[str, Track]] = {}  # by frame and object
         self._frame: tuple[int, float] | None = None  # number and time of the newest frame
         self._seq = 0  # of the newest track
 
     def updates(self, sent: dict[str, Any]) -> dict[str, Any]:
-        """Return the parts that differ from those that a page was `sent`, a dictionary that is empty at first.
+        """Return the parts that have changed since the last call with `sent`, a dictionary that is empty at first.
 
-        If another pipeline is shown, these are all parts, with `pipeline` as the first one. Of the points, they are
-        those after the last one that was sent.
+        For a new pipeline, all parts are returned, beginning with `pipeline`. Only new points are returned.
         """
         parts = {
-            "pipeline": len(self._runs_before),
+            "pipeline": len(self._earlier_runs),
             "status": self._status_part(),
             "tracks": self._tracks_part(),
             "picture": self._picture_part(),
@@ -112,7 +111,7 @@ class Dashboard:
             self.reason = reason
 
     def attach(self, endpoint: str) -> None:
-        """Expect messages from this endpoint from now on; the state is kept until the first one arrives."""
+        """Expect messages from this endpoint; the state remains until the first one arrives."""
         self._attached = endpoint
         if self.phase == "waiting":
             self.endpoint = endpoint
@@ -120,13 +119,13 @@ class Dashboard:
     def take(self, message: object, now: float, run: str = "") -> None:
         """Process a message that arrived at the time `now`, in seconds of a monotonic clock.
 
-        It is from the run with this id; without one, from the run that is shown.
+        `run` is the id of its run, by default the present one.
         """
-        if run in self._runs_before:
+        if run in self._earlier_runs:
             return
         if run and run != self._run:
             if self._run:
-                self._runs_before.add(self._run)
+                self._earlier_runs.add(self._run)
                 self._reset()
             self._run, self.endpoint = run, self._attached
         if self.phase in ("waiting", "silent") and not isinstance(message, End):
@@ -145,7 +144,7 @@ class Dashboard:
 
     @property
     def state(self) -> tuple[str, str]:
-        """The state of the pipeline, as a name and in words: of the run while it runs, otherwise the phase."""
+        """Name and description of the state of the pipeline: of the run while it runs, otherwise of the phase."""
         if self.phase != "running":
             return {
                 "waiting": ("none", "no pipeline runs"),
@@ -153,13 +152,13 @@ class Dashboard:
                 "ended": ("ended", "ended"),
             }[self.phase]
         counters = self.health["detector"].counters if "detector" in self.health else {"sent": 0.0}
-        if self._seq > counters.get("sent", 0.0):  # a frame was tracked since the report
+        if self._seq > counters.get("sent", 0.0):  # a frame was tracked after the report
             return "running", "running"
         return run_state(counters) if "detector" in self.health else ("starting", "starting")
 
     @property
-    def _holds(self) -> bool:
-        """True if no frames are tracked: where the objects are is not known."""
+    def _suspended(self) -> bool:
+        """True if no frames are tracked, so the positions of the objects are unknown."""
         return self.state[0] in ("lost", "waiting", "paused")
 
     def rate(self, now: float) -> float:
@@ -168,12 +167,12 @@ class Dashboard:
         return len(list(recent)) / RATE_SECONDS
 
     def picture(self, time: float) -> Preview | None:
-        """Return the picture of the recent frame at a time, None if it is not kept."""
+        """Return the picture of the frame at a time, None if it is no longer stored."""
         return self._pictures.get(time)
 
     @property
     def newest(self) -> tuple[Preview, list[Track]] | None:
-        """The newest picture, and the tracks of its frame as far as they have arrived."""
+        """The newest picture, and the received tracks of its frame."""
         preview = next(reversed(self._pictures.values()), None)
         if preview is None:
             return None
@@ -182,8 +181,8 @@ class Dashboard:
 
     def _add_track(self, track: Track, now: float) -> None:
         self._seq = track.seq
-        name, before = track.object, self.objects.get(track.object)
-        if before is None or before.began not in (None, track.began):  # another object of this name begins
+        name, previous = track.object, self.objects.get(track.object)
+        if previous is None or previous.began not in (None, track.began):  # a new object with this name
             self.objects[name] = TrackedObject(self.colours.of(name))
         tracked = self.objects[name]
         tracked.state, tracked.score, tracked.version = track.state, track.score, track.model_version
@@ -196,7 +195,7 @@ class Dashboard:
         self._add_point(now)
 
     def _add_model(self, model: Model, now: float) -> None:
-        """Measure the latency of a new model of a shown object; not of another object that had the name before."""
+        """Measure the latency of a new model of an object; models of an earlier object with its name are ignored."""
         tracked, arrived = self.objects.get(model.object), self._arrivals.get(model.frame)
         if tracked is None or tracked.began != model.began or tracked.trained == model.version:
             return
@@ -213,15 +212,15 @@ class Dashboard:
         self._add_point(now)
 
     def _add_objects(self, health: Health) -> None:
-        """Add the objects of the detector's report that have no track yet; drop those that it does not track."""
-        if len(health.objects) != health.counters.get("objects"):  # it has no track of some objects yet
+        """Add the objects of the detector's report that have no track yet, and drop objects that it lacks."""
+        if len(health.objects) != health.counters.get("objects"):  # some objects have no track yet
             return
         for name, counters in health.objects.items():
             if name not in self.objects:
                 version = int(counters.get("model_version", 0))
                 state: State = "absent" if not counters.get("present") else "present" if version else "bootstrapping"
                 self.objects[name] = TrackedObject(self.colours.of(name), state, counters.get("score", 0.0), version)
-        sent = health.counters.get("sent", 0)  # a track after this one may be of an object that began later
+        sent = health.counters.get("sent", 0)  # objects with a later track may have begun after the report
         for name, tracked in list(self.objects.items()):
             if name not in health.objects and tracked.seq <= sent:
                 del self.objects[name]
@@ -232,7 +231,7 @@ class Dashboard:
             return
         objects = {
             name: (round(tracked.score, 3), tracked.model_latency, tracked.version, tracked.state != "absent")
-            for name, tracked in ({} if self._holds else self.objects).items()
+            for name, tracked in ({} if self._suspended else self.objects).items()
         }
         self._points.append((round(now, 3), self.rate(now), objects))
 
@@ -250,7 +249,7 @@ class Dashboard:
         frame, time = self._frame or (None, None)
         objects = [
             {"name": name, "colour": tracked.colour, "version": tracked.version}
-            | {"state": None if self._holds else tracked.state, "score": None if self._holds else tracked.score}
+            | {"state": None if self._suspended else tracked.state, "score": None if self._suspended else tracked.score}
             for name, tracked in self.objects.items()
         ]
         return {"frame": frame, "time": time, "objects": objects}
@@ -271,7 +270,7 @@ class Dashboard:
 
 
 def _remember(recent: dict[Key, Value], key: Key, value: Value, most: int) -> None:
-    """Set the newest entry of a dictionary of the last `most` ones."""
+    """Set an entry of a dictionary that stores the last `most` entries."""
     recent.pop(key, None)
     recent[key] = value
     if len(recent) > most:

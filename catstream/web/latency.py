@@ -15,7 +15,7 @@ class Latency:
     """Measures the seconds between the arrival of a live frame and the arrival of its track at this process."""
 
     def __init__(self) -> None:
-        self._zero: tuple[str, float] | None = None  # of a run, Unix time at which the time of its source is 0
+        self._zero: tuple[str, float] | None = None  # id of a run, and the Unix time of time 0 of its source
         self.histogram = Histogram(
             "catstream_track_latency_seconds",
             "Seconds from the arrival of a frame of a live source at the pipeline, by the clock of its machine, to the "
@@ -25,7 +25,7 @@ class Latency:
         )
 
     def take(self, message: object, run: str) -> None:
-        """Process a message of the run with this id as soon as it has arrived."""
+        """Process a message of a run; call this immediately after its arrival."""
         if isinstance(message, Health) and message.process == "detector":
             self._zero = (run, zero) if (zero := message.counters.get("zero_time")) is not None else None
         elif isinstance(message, Track) and self._zero is not None and self._zero[0] == run:

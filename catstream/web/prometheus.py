@@ -1,9 +1,8 @@
 """The metrics of a pipeline, or of the streams and nodes of a fleet, in Prometheus's text format.
 
-Each counter of the health reports is a metric `catstream_PROCESS_COUNTER`, with the label `object` if it is one of each
-object. If it counts up, it is a Prometheus counter and ends with `_total`; it begins again at 0 with a restarted
-process, which `rate` and `increase` of Prometheus take into account. Each metric of a pipeline names its source,
-without user and password.
+Each counter of the health reports is a metric `catstream_PROCESS_COUNTER`, with the label `object` if each object has
+it. Counters that only increase are Prometheus counters and end with `_total`. They restart at 0 with a process, which
+`rate` and `increase` of Prometheus handle. Each metric of a pipeline has its source, without user and password.
 """
 
 from __future__ import annotations
@@ -19,21 +18,20 @@ from catstream.web.feed import PipelineFeed
 from catstream.wire.heads import TREES
 from catstream.wire.messages import FleetStatus, NodeStatus, StreamStatus
 
-# Each counter would have another metric with the time of its first sample.
+# Otherwise each counter would have a second metric with the time of its first sample.
 disable_created_metrics()  # type: ignore[no-untyped-call]
 
 #: A sample: name, value and labels.
 Sample = tuple[str, float, dict[str, str]]
 
-
-#: Counters of the processes, streams and nodes that only count up.
+#: Counters of the processes, streams and nodes that only increase.
 _COUNT_UP = {"sent", "processed", "stored", "skipped", "reconnects", "damaged", "scaled", "rejected", "frames", "rows"}
 _COUNT_UP |= {"not_written", "leaves", "trained", "missed", *(f"{tree}_leaves" for tree in TREES)}
 
-#: Counters of the detector without a metric: they are constant, or in `state`, `paused` and `source_lost_seconds`.
+#: Counters of the detector without a metric: constants, and counters in `state`, `paused` and `source_lost_seconds`.
 _OMITTED = {"paused", "waiting", "ended", "lost_seconds", "zero_time", "width", "height", "start", "stride"}
 
-#: Help of each metric, by its name, or by the name of the counter in the health reports.
+#: Help of each metric, by its name or by the name of the counter in the health reports.
 _HELP = {
     "up": "1 if the pipeline sends messages.",
     "state": "1 for the present state: none, starting, running, paused, waiting (for a box), lost, silent or ended.",
@@ -98,7 +96,7 @@ def response(samples: Iterable[Sample], *histograms: Histogram) -> Response:
 
 
 def of_pipeline(feed: PipelineFeed) -> Iterator[Sample]:
-    """The samples of a pipeline; only `up` and `state` while it does not run."""
+    """The samples of a pipeline; only `viewers`, `up` and `state` while it does not run."""
     dashboard = feed.dashboard
     yield "viewers", feed.viewers, {}
     running, of = dashboard.phase == "running", {"source": dashboard.source}
@@ -112,7 +110,7 @@ def of_pipeline(feed: PipelineFeed) -> Iterator[Sample]:
     for process, report in dashboard.health.items() if running else ():
         yield f"{process}_age_seconds", max(0.0, time() - report.time), of
         of_objects = {counter for counters in report.objects.values() for counter in counters}
-        for counter in report.counters.keys() - of_objects - _OMITTED:  # their sums are left to Prometheus
+        for counter in report.counters.keys() - of_objects - _OMITTED:  # Prometheus can sum over objects
             yield f"{process}_{counter}", report.counters[counter], of
         for name, counters in report.objects.items():
             for counter, value in counters.items():
@@ -120,7 +118,7 @@ def of_pipeline(feed: PipelineFeed) -> Iterator[Sample]:
 
 
 def of_fleet(status: FleetStatus | None) -> Iterator[Sample]:
-    """The samples of a fleet: each number of its streams and nodes; only `fleet_up` if it does not answer."""
+    """The samples of a fleet: each numeric field of its streams and nodes; only `fleet_up` if it does not answer."""
     yield "fleet_up", status is not None, {}
     if status is None:
         return
@@ -139,5 +137,5 @@ def of_fleet(status: FleetStatus | None) -> Iterator[Sample]:
 def _of_status(kind: str, status: StreamStatus | NodeStatus, labels: dict[str, str]) -> Iterator[Sample]:
     yield f"{kind}_state", 1, labels | {"state": status.state}
     for field in fields(status):
-        if field.name != "token" and isinstance(value := getattr(status, field.name), int | float):  # of the store
+        if field.name != "token" and isinstance(value := getattr(status, field.name), int | float):  # a fencing token
             yield f"{kind}_{field.name}", value, labels

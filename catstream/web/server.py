@@ -1,4 +1,4 @@
-"""The web server of a page, with its access control; it runs in this thread or in one of its own."""
+"""The web server of a page, with access control; it runs in the calling or in a background thread."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ from catstream.web.app import Site
 from catstream.web.wall import Wall
 
 _LOGIN_PAGE = Path(__file__).with_name("page") / "login.html"
-_PUBLIC_PATHS = ("/healthz", "/readyz", "/page/")  # they reveal only whether the pipeline tracks, or why not
+_PUBLIC_PATHS = ("/healthz", "/readyz", "/page/")  # reveal only the readiness of the pipeline
 
 _MIN_TOKEN_LENGTH = 16
 _LOOPBACK = ("127.0.0.1", "::1", "localhost")
 
-SHUTDOWN_SECONDS = 2  #: after which a response that has not ended with the server is cut off; twice that for commands
-KEEP_ALIVE_SECONDS = 5  #: after which a connection without a request is closed
+SHUTDOWN_SECONDS = 2  #: timeout of the shutdown for stalled responses; twice this for commands
+KEEP_ALIVE_SECONDS = 5  #: time without a request after which a connection is closed
 _MAX_CONNECTIONS = 256
-_MAX_HEAD = 16384  # bytes
+_MAX_HEADERS = 16384  # bytes
 
 #: Headers of all responses: no content from other hosts, no inline scripts, no frames.
 _HEADERS = {
@@ -53,12 +53,12 @@ _HEADERS = {
 
 
 class Server:
-    """The web server of a site, with access control. Its constructor begins to listen; port 0 is a free one.
+    """The web server of a site, with access control. The constructor begins to listen; port 0 selects a free port.
 
-    Clients must have the token; None, which is possible on 127.0.0.1 only, lets every user of this machine watch and
-    give commands. `url` is for a browser on this machine, with the token; `urls` has another one for other machines if
-    the server listens on all interfaces. If the port is in use, `attempts - 1` next ones are tried. ServiceError if the
-    page would be public without a token, the token is too short, or the ports are in use.
+    Clients need the token. Without one, which is allowed only on loopback, each user of this machine can watch and send
+    commands. `url` is for a browser on this machine, with the token; `urls` has a second URL for other machines if the
+    server listens on all interfaces. If the port is in use, the next `attempts - 1` ports are tried. ServiceError if
+    the page would be public without a token, the token is too short, or the ports are in use.
     """
 
     def __init__(
@@ -92,7 +92,7 @@ class Server:
             limit_concurrency=_MAX_CONNECTIONS,
             timeout_keep_alive=KEEP_ALIVE_SECONDS,
             timeout_graceful_shutdown=2 * SHUTDOWN_SECONDS,
-            h11_max_incomplete_event_size=_MAX_HEAD,
+            h11_max_incomplete_event_size=_MAX_HEADERS,
         )
         self._server = _Uvicorn(config, site.close)
 
@@ -103,7 +103,7 @@ class Server:
 
     @contextlib.contextmanager
     def in_background(self) -> Iterator[None]:
-        """Serve in a thread of its own inside a `with`."""
+        """Serve in a background thread inside a `with`."""
         thread = threading.Thread(target=self._server.run, args=([self._socket],), name="view", daemon=True)
         thread.start()
         try:
@@ -116,7 +116,7 @@ class Server:
 class _Uvicorn(uvicorn.Server):
     """Closes the streams of open pages before the shutdown, which waits for all connections.
 
-    A second Ctrl-C changes nothing: uvicorn would leave out the end of the site, and print the stack of it.
+    A second Ctrl-C is ignored: uvicorn would skip the shutdown of the site, and print a traceback.
     """
 
     def __init__(self, config: uvicorn.Config, close: Callable[[], None]) -> None:
@@ -133,14 +133,14 @@ class _Uvicorn(uvicorn.Server):
         await super().shutdown(sockets)
 
     def _abort_stalled(self) -> None:
-        """Cut off viewers that do not read: uvicorn would cancel their responses, and log a traceback for each."""
+        """Abort connections that do not read: uvicorn would cancel their responses, and log a traceback for each."""
         for connection in list(self.server_state.connections):
             if connection.transport.get_write_buffer_size():
                 connection.transport.abort()
 
 
 def _listen(host: str, port: int, attempts: int) -> socket.socket:
-    """Listen on a port, or on one of the next ones if it is in use."""
+    """Listen on a port, or on the next free one of `attempts` ports."""
     try:
         families = {family for family, *_ in socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)}
         if socket.AF_INET not in families:
@@ -157,10 +157,10 @@ def _listen(host: str, port: int, attempts: int) -> socket.socket:
 class Guard:
     """ASGI middleware that checks each request before an application receives it.
 
-    With a token, a request must have it as `?token=TOKEN`, as `Authorization: Bearer TOKEN`, or as the cookie that a
-    page sets if it is opened with `?token=TOKEN`. Without a token, only requests to a loopback host name are answered;
-    this prevents DNS rebinding. Requests that change something must come from a page of the same origin, or from a
-    program, which sends no Origin header; this prevents CSRF. The length of the token protects it from being guessed.
+    With a token, a request needs `?token=TOKEN`, `Authorization: Bearer TOKEN`, or the cookie that a page sets if it is
+    opened with `?token=TOKEN`. Without a token, only requests to a loopback host name are answered, which prevents DNS
+    rebinding. Unsafe requests must come from a page of the same origin, or from a program, which sends no Origin
+    header; this prevents CSRF. The length of the token prevents brute force.
     """
 
     def __init__(self, app: ASGIApp, token: str | None) -> None:
@@ -173,7 +173,7 @@ class Guard:
         self._token_digest = None if token is None else _digest(token)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] != "http":  # start-up and shutdown events of the server
+        if scope["type"] != "http":  # lifespan events of the server
             await self._app(scope, receive, send)
             return
 
@@ -183,12 +183,12 @@ class Guard:
             await send(message)
 
         request = Request(scope, receive)
-        answer = _reject_foreign(request) or self._check_token(request) or self._app
-        await answer(scope, receive, send_with_headers)
+        response = _reject_foreign(request) or self._check_token(request) or self._app
+        await response(scope, receive, send_with_headers)
 
     def _check_token(self, request: Request) -> Response | None:
-        """Return the answer to a request without the token, or to a page that is opened with it in its URL."""
-        path: str = request.scope["path"]  # as in the routes; `request.url` depends on the client's Host header
+        """Return the response to a request without the token, or to a page that is opened with the token in its URL."""
+        path: str = request.scope["path"]  # unlike `request.url`, independent of the client's Host header
         if self._token_digest is None or path.startswith(_PUBLIC_PATHS):
             return None
         cookie = f"catstream-{self._token_digest[:8]}"  # browsers send a cookie to all ports of a host
@@ -206,7 +206,7 @@ class Guard:
 
 
 def _reject_foreign(request: Request) -> Response | None:
-    """Return an error if a request that changes something comes from a page of another origin."""
+    """Return an error for an unsafe request from a page of another origin."""
     host, origin = request.headers.get("host", ""), request.headers.get("origin")
     if request.method not in ("GET", "HEAD") and origin is not None and origin.partition("://")[2] != host:
         return PlainTextResponse(f"rejected: the request comes from a page of another origin, {origin!r}\n", 403)
@@ -215,12 +215,12 @@ def _reject_foreign(request: Request) -> Response | None:
 
 def _enter(request: Request, cookie: str, digest: str) -> Response:
     """Set the cookie, and redirect to the same page without the token in its URL."""
-    answer = RedirectResponse("./", 303)
+    response = RedirectResponse("./", 303)
     secure = request.headers.get("x-forwarded-proto") == "https"
-    answer.set_cookie(cookie, digest, httponly=True, samesite="lax", secure=secure)
-    return answer
+    response.set_cookie(cookie, digest, httponly=True, samesite="lax", secure=secure)
+    return response
 
 
 def _digest(token: str) -> str:
-    """Return the digest of a token, which is the value of the cookie and is compared in place of the token."""
+    """Return the digest of a token, which is the value of the cookie and is compared instead of the token."""
     return hashlib.sha256(b"catstream view\0" + token.encode()).hexdigest()[:32]

@@ -1,4 +1,4 @@
-"""The web application of a fleet: a wall of pictures, and below it the page of each stream.
+"""The web application of a fleet: a wall of pictures, and a page for each stream.
 
 /                       the page
 /status                 all streams and nodes as JSON, which the page requests every second
@@ -35,12 +35,12 @@ from catstream.web.app import PAGE, Site
 from catstream.web.feed import PipelineFeed
 from catstream.wire.messages import FleetStatus, NodeStatus, StreamStatus
 
-PERIOD_SECONDS = 1.0  #: between two questions to the registry
-REGISTRY_SECONDS = 2.0  #: limit for its answer
-IDLE_SECONDS = 60.0  #: without a request, after which the page of a stream is closed
+PERIOD_SECONDS = 1.0  #: interval between two requests to the registry
+REGISTRY_SECONDS = 2.0  #: timeout for its answer
+IDLE_SECONDS = 60.0  #: time without a request after which the site of a stream is closed
 
-_MAX_SITES = 32  # pages of streams at once: each has a thread
-_HIDDEN = ("endpoint", "server", "token")  # of a stream: where its pipeline is, and its key
+_MAX_SITES = 32  # maximum number of open sites of streams: each has a thread
+_HIDDEN = ("endpoint", "server", "token")  # fields of a stream with its address and key
 
 _log = logging.getLogger(__name__)
 
@@ -48,18 +48,18 @@ _log = logging.getLogger(__name__)
 class Wall:
     """The web application of a fleet, `app`, without access control; `Server` serves it.
 
-    The address names the fleet and no stream; the fleet may start later. The last status is shown while the fleet does
-    not answer.
+    The address is of a fleet without a stream; the fleet may start later. While it does not answer, the last status is
+    shown.
     """
 
     def __init__(self, address: Address) -> None:
         self._address = address
         self._registry: Registry | None = None
         self._status = FleetStatus("", 0.0)
-        self._answered = 0.0  # moment of the last answer
-        self._problem = ""  # why the fleet does not answer
-        self._sites: dict[str, Site] = {}  # of the streams whose page was requested
-        self._used: dict[str, float] = {}  # moment of the last request to each of them
+        self._answered = 0.0  # time of the last answer
+        self._problem = ""  # reason why the fleet does not answer, empty if it does
+        self._sites: dict[str, Site] = {}  # of streams whose page was requested
+        self._used: dict[str, float] = {}  # time of the last request to each site
         self._closing = asyncio.Event()
         routes = [
             Route("/", lambda _: FileResponse(PAGE / "fleet.html")),
@@ -81,7 +81,7 @@ class Wall:
 
     @asynccontextmanager
     async def _lifespan(self, _: Starlette) -> AsyncIterator[None]:
-        await asyncio.to_thread(self._ask)  # the first requests wait, so that each stream is known
+        await asyncio.to_thread(self._ask)  # before the first request, which may be for a stream
         asking = asyncio.create_task(self._keep_asking())
         yield
         await asking
@@ -98,7 +98,7 @@ class Wall:
                 await asyncio.wait_for(self._closing.wait(), PERIOD_SECONDS)
 
     def _ask(self) -> None:
-        """Ask the registry for all streams and nodes."""
+        """Request all streams and nodes from the registry."""
         try:
             if self._registry is None:
                 self._registry = self._address.registry
@@ -117,7 +117,7 @@ class Wall:
         return self._status.streams[stream]
 
     def site(self, stream: str) -> Site:
-        """The site of a stream, which the first request to its page opens."""
+        """The site of a stream, opened by the first request for its page."""
         self._find(stream)
         if stream not in self._sites:
             if len(self._sites) >= _MAX_SITES:
@@ -130,7 +130,7 @@ class Wall:
         return self._sites[stream]
 
     def _close_unused(self, seconds: float) -> None:
-        """Close the sites without open pages, and without a request for some seconds."""
+        """Close the sites without open pages that had no request for `seconds`."""
         for stream, site in list(self._sites.items()):
             if not site.feed.viewers and monotonic() - self._used[stream] >= seconds:
                 self._sites.pop(stream).feed.end()
@@ -154,7 +154,7 @@ class Wall:
         return prometheus.response(prometheus.of_fleet(None if self._problem else self._status))
 
     async def _readyz(self, request: Request) -> Response:
-        """Answer for the fleet, without a token and therefore without an address; or for a stream."""
+        """Readiness of the fleet or of a stream. It needs no token, so it must not reveal an address."""
         problem = "the fleet does not answer" if self._problem else ""
         if not problem and (stream := request.path_params.get("stream")):
             status = self._find(stream)
@@ -163,5 +163,5 @@ class Wall:
 
 
 def _shown(status: StreamStatus | NodeStatus) -> dict[str, Any]:
-    """What the page shows of a stream or a node: neither the address nor a key of a pipeline."""
+    """The fields of a stream or a node for the page, without the address and the key of a pipeline."""
     return {name: value for name, value in asdict(status).items() if name not in _HIDDEN}

@@ -1,16 +1,16 @@
 // The page of `catstream annotate`: a frame, the timelines of the objects, and changes of boxes, which are sent at once.
-// Of several videos, one is open.
+// One of several videos is open.
 
 import { $, add, Items, make, many, post, write } from "./dom.js";
 import { FrameStage } from "./frame.js";
 
 const JUMP = 25; // frames of a page key
-const WAYS = { "1 forwards": "#74c0fc", "2 backwards": "#f783ac" }; // names and colours of the proposals; no object has a blank in its name
+const WAYS = { "1 forwards": "#74c0fc", "2 backwards": "#f783ac" }; // names and colours of proposals; names of objects have no blanks
 const CHECKS = { keyframe: "your box", hidden: "hidden, its box is estimated", checked: "checked", unchecked: "may be wrong" };
 const KEYS = { n: "next", enter: "next", b: "back", u: "undo", 1: "first", 2: "second", d: "draw", a: "absent", h: "hidden", o: "new",
   v: "video", delete: "delete", backspace: "delete", "+": "closer", "=": "closer", "-": "farther", 0: "whole", "?": "help" };
 
-/** The name of a key in `KEYS`: by its label, else by its place, as on a keyboard with other letters. */
+/** The name of a key in `KEYS`: by its label or, on keyboards with other letters, by its position. */
 function nameOf({ key, code }) {
   const label = key.toLowerCase();
   return label in KEYS ? label : code.replace(/^(Key|Digit|Numpad)/, "").toLowerCase();
@@ -18,8 +18,8 @@ function nameOf({ key, code }) {
 
 class AnnotatePage {
   constructor() {
-    Object.assign(this, { state: null, frame: 0, chosen: null, boxes: {}, visited: [], places: {}, edits: [], sent: Promise.resolve(), silent: false, ended: "" });
-    this.stage = new FrameStage($("#stage"), this, { hold: () => ({ frame: this.frame }), follow: (box) => this.set(box, this.stage.picture.frame), changed: () => {},
+    Object.assign(this, { state: null, frame: 0, chosen: null, boxes: {}, visited: [], lastFrames: {}, edits: [], sent: Promise.resolve(), silent: false, ended: "" });
+    this.stage = new FrameStage($("#stage"), this, { freeze: () => ({ frame: this.frame }), follow: (box) => this.set(box, this.stage.picture.frame), changed: () => {},
       zoomed: (scale) => write($("#whole span"), `${Math.round(100 * scale)} %`) });
     this.rows = new Items($("#timelines"), { make: (name) => this.makeRow(name), fill: (row, one) => this.fillRow(row, one) });
     this.videos = new Items($("#list"), { make: (number) => this.makeVideo(Number(number)), fill: (item, one) => this.fillVideo(item, one) });
@@ -34,7 +34,7 @@ class AnnotatePage {
     addEventListener("keydown", (event) => this.key(event));
     addEventListener("keyup", ({ code }) => { if (code === "Space") this.stage.grabs = false; });
     addEventListener("pagehide", () => this.commit());
-    addEventListener("click", ({ detail, target }) => detail && target.closest("button")?.blur()); // Enter means next again
+    addEventListener("click", ({ detail, target }) => detail && target.closest("button")?.blur()); // so that Enter means "next" again
     new ResizeObserver(() => this.stage.draw()).observe($("#stage"));
     this.events = new EventSource("events");
     this.events.onmessage = ({ data }) => this.receive(JSON.parse(data));
@@ -42,7 +42,7 @@ class AnnotatePage {
     this.choose(null);
   }
 
-  /** Show what has changed on the server, or that it has ended. */
+  /** Show the changes of the server's state, or its end. */
   receive({ closed, ...changes }) {
     const state = { ...this.state, ...changes };
     if (!closed && this.state && state.server !== this.state.server) return this.end("Another command serves this address now: reload the page.");
@@ -59,7 +59,7 @@ class AnnotatePage {
     this.show();
   }
 
-  // The interface of the objects that a stage shows.
+  // The interface of the objects on a stage.
   get focus() {
     return Object.values(this.proposals).find(Boolean) ?? this.boxes[this.chosen]?.box;
   }
@@ -72,7 +72,7 @@ class AnnotatePage {
     return Object.hasOwn(WAYS, name) ? { colour: WAYS[name] } : this.state?.objects.find((one) => one.name === name);
   }
 
-  /** Choose an object, null for a new one; a proposal is taken. */
+  /** Choose an object, null for a new one, or accept a proposal. */
   choose(name, typed = name) {
     if (Object.hasOwn(WAYS, name)) return this.take(name);
     this.chosen = name;
@@ -88,28 +88,28 @@ class AnnotatePage {
   go(frame, name = this.chosen) {
     this.stage.leave();
     this.frame = Math.max(0, Math.min((this.state?.frames ?? 1) - 1, frame));
-    this.boxes = {}; // the proposals of another frame cannot be taken
+    this.boxes = {}; // proposals of another frame cannot be accepted
     if (name !== this.chosen) this.choose(name);
     this.show();
     this.load();
   }
 
-  /** Show another video, where it was left. */
-  change(before) {
+  /** Show another video at its last shown frame. */
+  change(previous) {
     const { objects, video } = this.state;
-    this.places[before] = this.frame;
-    Object.assign(this, { boxes: {}, visited: [], frame: this.places[video] ?? 0 });
+    this.lastFrames[previous] = this.frame;
+    Object.assign(this, { boxes: {}, visited: [], frame: this.lastFrames[video] ?? 0 });
     this.stage.clear();
     this.stage.zoom = 1;
     this.choose(objects[0]?.name ?? null);
   }
 
-  /** Save what is being changed, and open another video. */
+  /** Save pending changes, and open another video. */
   async open(video) {
     if (video !== undefined && await this.commit()) this.send("open", { video });
   }
 
-  /** The next video that is not checked, undefined if there is none. */
+  /** The next unchecked video, or undefined. */
   get other() {
     const { video = 0, videos = [] } = this.state ?? {}, order = [...videos.keys()];
     return [...order.slice(video + 1), ...order.slice(0, video)].find((number) => videos[number][1] < 1);
@@ -120,7 +120,7 @@ class AnnotatePage {
     this.go(frame, name);
   }
 
-  /** Load the boxes and the picture of the frame; of several frames in a row, the last one. */
+  /** Load the boxes and the picture of the frame; while loading, only the last requested frame is loaded next. */
   async load() {
     this.wanted = true;
     if (this.loading) return;
@@ -130,7 +130,7 @@ class AnnotatePage {
       const { frame, sent, edits: { length }, state: { video } } = this, query = video ? `video=${video}` : "";
       const answer = await fetch(`frames/${frame}?${query}`).then((response) => response.ok && response.json(), () => null);
       if (!answer || video !== this.state.video) continue;
-      if (this.stage.picture?.frame === frame && (length || this.edits.length || sent !== this.sent)) { // it may be older than a box that is shown
+      if (this.stage.picture?.frame === frame && (length || this.edits.length || sent !== this.sent)) { // the answer may be older than a pending edit
         await this.sent;
         this.wanted = true;
         continue;
@@ -138,7 +138,7 @@ class AnnotatePage {
       const { size: [width, height], objects } = answer;
       const shown = this.stage.picture?.frame === frame;
       if (!shown) await this.stage.show({ frame, query, width, height, boxes: {} });
-      this.boxes = objects; // with their picture, as they can be changed then
+      this.boxes = objects; // together with their picture, because they can be edited
       this.showBoxes();
       if (!shown && this.stage.picture) this.stage.reveal();
       this.show();
@@ -146,14 +146,14 @@ class AnnotatePage {
     this.loading = false;
   }
 
-  /** The proposals for the chosen object in this frame, by name: a box, null if it is absent. */
+  /** The proposals for the chosen object in this frame by name: a box, or null if it is absent. */
   get proposals() {
     const { checked, proposals } = this.boxes[this.chosen] ?? {};
     if (checked !== "unchecked") return {};
     return Object.fromEntries(Object.keys(WAYS).flatMap((name, way) => (proposals[way] ? [[name, proposals[way][0]]] : [])));
   }
 
-  /** What is known of the chosen object in this frame. */
+  /** Description of the chosen object in this frame. */
   get check() {
     const { box, checked, proposals } = this.boxes[this.chosen] ?? {};
     if (!checked) return "";
@@ -169,7 +169,7 @@ class AnnotatePage {
     this.stage.draw();
   }
 
-  /** Send a change after the earlier ones; returns the answer once its state is here, null if it is rejected, with the reason shown. */
+  /** Send a change after earlier ones; returns the answer once the new state has arrived, or null after showing the reason of a rejection. */
   send(verb, more = {}) {
     const edit = { verb, video: this.state.video, ...more };
     this.edits.push(edit);
@@ -188,7 +188,7 @@ class AnnotatePage {
     return this.sent;
   }
 
-  /** Delete the box that was drawn for the chosen object in a frame, null for the object; its last box is the object. */
+  /** Delete the chosen object's box in a frame, or the object if the frame is null or it has no other box. */
   async delete(frame) {
     this.stage.cancel();
     const { chosen } = this;
@@ -196,7 +196,7 @@ class AnnotatePage {
     if (await this.send("delete", { object: chosen, frame }) && !this.get(chosen) && this.chosen === chosen) this.choose(null, chosen);
   }
 
-  /** True if the picture of a frame is shown; else what was meant for it is refused. */
+  /** True if the picture of a frame is shown; otherwise the action is refused with a message. */
   shows(frame) {
     return this.stage.picture?.frame === frame || Boolean(this.refuse(`Frame ${frame} is not shown yet: try again`));
   }
@@ -206,12 +206,12 @@ class AnnotatePage {
     return null;
   }
 
-  /** Send the box and the name that are being changed; false if one of them is rejected. */
+  /** Send pending changes of the box and of the name; returns false if one is rejected. */
   async commit() {
     return !(await Promise.all([this.stage.leave(), this.rename()])).includes(null);
   }
 
-  /** Save the box of the chosen object, or of a new one, in the frame that is shown; null if it is absent, "hidden" if it is covered. */
+  /** Save the box of the chosen or of a new object in the shown frame: null if it is absent, "hidden" if it is occluded. */
   async set(box, frame = this.frame) {
     this.stage.cancel();
     const { chosen, typed } = this, object = chosen ?? typed;
@@ -230,7 +230,7 @@ class AnnotatePage {
     if (name in this.proposals) this.set(this.proposals[name]);
   }
 
-  /** Begin with the box that is there, to change it with the keyboard. */
+  /** Begin to change the present box with the keyboard. */
   async draw() {
     if (this.stage.drawing || !this.shows(this.frame)) return;
     await this.stage.begin();
@@ -264,14 +264,14 @@ class AnnotatePage {
     if (await this.commit() && await this.send("done")) this.end("Done: the results are written, and the command has ended. This tab can be closed.");
   }
 
-  /** Show no other state from now on, but the reason. */
+  /** Stop the updates, and show the reason. */
   end(reason) {
     this.events.close();
     this.ended = reason;
     this.show();
   }
 
-  /** The frames to look at next, but this one. */
+  /** The next frames to check, without this one. */
   get following() {
     return (this.state?.next ?? []).filter(([frame, name]) => frame !== this.frame || name !== this.chosen);
   }
@@ -343,10 +343,10 @@ class AnnotatePage {
     element.style.setProperty("--colour", colour);
     choose.setAttribute("aria-pressed", String(chosen));
     const bar = (kind, first, last) => make("rect", { class: kind, x: first, width: last - first + 1, y: 1, height: 3 });
-    const mark = (kind, place) => make("line", { class: kind, x1: place + 0.5, x2: place + 0.5, y2: 5 });
+    const mark = (kind, at) => make("line", { class: kind, x1: at + 0.5, x2: at + 0.5, y2: 5 });
     line.setAttribute("viewBox", `0 0 ${frames} 5`);
     line.replaceChildren(bar("right", 0, frames - 1), ...unchecked.map(([first, last]) => bar("wrong", first, last)),
-      mark("now", frame), ...keyframes.map((place) => mark("", place)));
+      mark("now", frame), ...keyframes.map((at) => mark("", at)));
     const percent = Math.floor(100 * (1 - wrong / frames));
     write(share, `${percent}%`);
     line.setAttribute("aria-label", `${name}: ${many(keyframes.length, "box", "boxes")}, ${percent} % of the frames checked`);
@@ -391,7 +391,7 @@ class AnnotatePage {
     this.videos.show(videos.map(([label, share], number) => [String(number), { label, part: number === video ? this.part : share, open: number === video }]));
   }
 
-  /** What the server does, as a state for its colour and in words. */
+  /** The activity of the server: a state for its colour, and a description. */
   progress() {
     const { state, ended, silent } = this;
     if (ended) return ["ended", "page ended"];

@@ -1,4 +1,4 @@
-// Four charts of the last two minutes of one object: score, frames a second, latency, model.
+// Four charts of the last two minutes of an object: score, frames per second, latency, model version.
 
 import { figure, make } from "./dom.js";
 
@@ -31,7 +31,7 @@ export class Charts {
     this.draw();
   }
 
-  /** Take rows of [second, frames a second, {object: [score, latency, model, present]}]. */
+  /** Add rows of [second, frames per second, {object: [score, latency, model, present]}]. */
   add(rows) {
     if (!rows.length) return;
     this.rows.push(...rows);
@@ -46,7 +46,7 @@ export class Charts {
     for (const chart of this.charts) this.plot(chart, points);
   }
 
-  /** Plot one column of points of [second, frames a second, score, latency, model, present]. */
+  /** Plot a column of points [second, frames per second, score, latency, model, present]. */
   plot({ drawing, right, column, least, show, title }, all) {
     const points = all.filter((point) => point[column] !== null);
     const values = points.map((point) => point[column]);
@@ -67,15 +67,15 @@ export class Charts {
     ]);
     grid.push(make("text", { x: LEFT, y: tall - 3 }, `${Math.round(seconds)} s ago`));
     grid.push(make("text", { x: wide, y: tall - 3, "text-anchor": "end" }, "now"));
-    const away = spans(all).map(([from, to]) =>
+    const absences = spans(all).map(([from, to]) =>
       make("rect", { class: "away", x: x(from), y: TOP, width: Math.max(1, x(to) - x(from)), height: tall - TOP - BOTTOM }));
-    const line = pieces(points).map((piece) =>
+    const lines = pieces(points).map((piece) =>
       make("polyline", { points: piece.map((point) => `${x(point[0]).toFixed(1)},${y(point[column]).toFixed(1)}`).join(" ") }));
-    drawing.append(...away, ...grid, ...line);
+    drawing.append(...absences, ...grid, ...lines);
   }
 }
 
-/** The next round number. */
+/** Round up to a limit for an axis. */
 function round(value) {
   const ten = 10 ** Math.floor(Math.log10(value));
   return Number((ten * [1, 1.2, 1.5, 2, 3, 4, 5, 6, 8, 10].find((part) => value <= part * ten * 1.000001)).toPrecision(3));
@@ -83,22 +83,22 @@ function round(value) {
 
 /** Time spans in which the object was absent. */
 function spans(points) {
-  const found = [];
+  const absences = [];
   points.forEach((point, index) => {
     if (point[5] || index === 0) return;
-    const before = points[index - 1];
-    if (found.length && found.at(-1)[1] === before[0]) found.at(-1)[1] = point[0];
-    else found.push([before[0], point[0]]);
+    const previous = points[index - 1];
+    if (absences.length && absences.at(-1)[1] === previous[0]) absences.at(-1)[1] = point[0];
+    else absences.push([previous[0], point[0]]);
   });
-  return found;
+  return absences;
 }
 
-/** Pieces of the line, split at gaps of more than two seconds. */
+/** Split points at gaps of more than two seconds. */
 function pieces(points) {
-  const found = [];
+  const parts = [];
   points.forEach((point, index) => {
-    if (index === 0 || point[0] - points[index - 1][0] > 2) found.push([]);
-    found.at(-1).push(point);
+    if (index === 0 || point[0] - points[index - 1][0] > 2) parts.push([]);
+    parts.at(-1).push(point);
   });
-  return found;
+  return parts;
 }

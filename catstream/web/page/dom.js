@@ -1,9 +1,9 @@
 // Helpers for the elements of the page.
 
-/** The first element that a selector of CSS selects. */
+/** The first element that matches a CSS selector. */
 export const $ = (selector) => document.querySelector(selector);
 
-/** Append a new element, with some of its properties. */
+/** Append a new element with properties. */
 export function add(parent, tag, properties = {}) {
   const child = Object.assign(document.createElement(tag), properties);
   parent.append(child);
@@ -18,7 +18,7 @@ export function make(name, attributes = {}, ...children) {
   return element;
 }
 
-/** Change the text of an element, if it is another one. */
+/** Set the text of an element, if it is different. */
 export function write(element, text) {
   if (element.textContent !== text) element.textContent = text;
 }
@@ -26,17 +26,17 @@ export function write(element, text) {
 /** A number with its noun. */
 export const many = (count, noun, nouns = `${noun}s`) => `${count.toLocaleString("en")} ${count === 1 ? noun : nouns}`;
 
-/** A time span in the largest unit of which there are two or more. */
+/** Format a time span in the largest unit with a value of at least two. */
 export function duration(seconds) {
   if (seconds < 120) return `${seconds} s`;
   return seconds < 7200 ? `${Math.floor(seconds / 60)} min` : `${Math.floor(seconds / 3600)} h`;
 }
 
-/** Send fields to the server as JSON; returns its answer, or the reason why there is none. */
+/** Send fields to the server as JSON; returns its answer, or the reason of a failure. */
 export async function post(url, fields) {
   try {
     const headers = { "Content-Type": "application/json" };
-    const response = await fetch(url, { method: "POST", headers, keepalive: true, body: JSON.stringify(fields) }); // also if the page is closed
+    const response = await fetch(url, { method: "POST", headers, keepalive: true, body: JSON.stringify(fields) }); // keepalive: even if the page is closed
     const json = (response.headers.get("Content-Type") || "").startsWith("application/json");
     return json ? await response.json() : { done: false, reason: (await response.text()).trim() };
   } catch {
@@ -44,7 +44,7 @@ export async function post(url, fields) {
   }
 }
 
-/** A figure with a left and a right caption, and an SVG drawing below. */
+/** Append a figure with a left and a right caption, and an SVG drawing below. */
 export function figure(parent, className, title) {
   const element = add(parent, "figure", { className });
   const caption = add(element, "figcaption");
@@ -55,14 +55,14 @@ export function figure(parent, className, title) {
   return { caption, left, right, drawing };
 }
 
-/** The children of an element by name: each is made when its name is first shown, and removed when it is shown no longer. */
+/** The children of an element by name: each is created when its name is first shown, and removed when it is not. */
 export class Items {
   /** make(name, value) returns an item with its `element`; fill(item, value) shows a value in it. */
   constructor(parent, { make, fill }) {
     Object.assign(this, { parent, make, fill, items: new Map() });
   }
 
-  /** Show these pairs of name and value, in this order; only values and places that have changed are touched. */
+  /** Show pairs of name and value in this order; only changed values and positions are updated. */
   show(pairs) {
     const items = new Map(pairs.map(([name, value]) => [name, this.items.get(name) ?? this.make(name, value)]));
     for (const [name, item] of this.items) if (!items.has(name)) item.element.remove();

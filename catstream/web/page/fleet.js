@@ -1,5 +1,5 @@
-// The page of a fleet: a wall of the streams, each with a picture and a link to its page, and a table of the nodes. Trouble
-// comes first. Once a second, it requests the state of the fleet, and the pictures that are in view.
+// The page of a fleet: a wall of the streams, each with a picture and a link to its page, and a table of the nodes. Streams
+// with trouble come first. Once a second, it requests the state of the fleet, and the visible pictures.
 
 import { $, add, duration, Items, many, write } from "./dom.js";
 
@@ -11,7 +11,7 @@ const byNumber = new Intl.Collator("en", { numeric: true }).compare; // cam-9 be
 const wall = new Items($(".wall"), { make: makeStream, fill: fillStream });
 const nodes = new Items($("#nodes tbody"), { make: makeNode, fill: fillNode });
 let fleet = { name: "", problem: "", age: null, streams: [], nodes: [] }; // the last answer
-let answered = Date.now(); // when it arrived
+let answered = Date.now(); // its arrival time
 
 async function update() {
   let silent = false;
@@ -29,7 +29,7 @@ async function update() {
   if (current) showPictures();
 }
 
-/** Show the last answer, and why it is not current. */
+/** Show the last answer, and the reason if it is not current. */
 function show(silent, current) {
   const trouble = fleet.streams.filter(level).length, running = fleet.streams.filter((one) => one.state === "running").length;
   wall.show(inOrder(fleet.streams));
@@ -49,7 +49,7 @@ function show(silent, current) {
   $("#silence").hidden = current;
 }
 
-/** Request the pictures in view; the next picture of a stream only after the one before. */
+/** Request the visible pictures; a stream's next picture only after the previous one. */
 function showPictures() {
   for (const { name, state } of fleet.streams) {
     const { element, picture } = wall.items.get(name), { top, bottom, height } = element.getBoundingClientRect();
@@ -59,7 +59,7 @@ function showPictures() {
   }
 }
 
-/** 2 for what does not run because of trouble, 1 for what runs with trouble, 0 without. */
+/** Level of trouble: 2 if it does not run, 1 if it runs with a problem, 0 without a problem. */
 function level({ state, trouble }) {
   return ["failed", "dead"].includes(state) ? 2 : trouble ? 1 : 0;
 }
@@ -80,7 +80,7 @@ function fillPill({ pill, word }, state, words = WORDS[state] ?? state) {
   write(word, words);
 }
 
-/** A tile of the wall: the picture, the name, the state, the objects, the trouble, and figures. */
+/** A tile of the wall: picture, name, state, objects, trouble and figures. */
 function makeStream(name) {
   const element = document.createElement("li");
   add(element, "a", { href: `streams/${encodeURIComponent(name)}/`, textContent: name });

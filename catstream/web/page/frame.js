@@ -1,16 +1,16 @@
-// The picture of a frame of a video, which is zoomed and moved; the box of the chosen object is drawn, and its edges are dragged.
+// A frame of a video with zoom and pan; the box of the chosen object can be drawn, and its edges can be dragged.
 
 import { make } from "./dom.js";
 import { Stage } from "./stage.js";
 
-const LARGE = 1920; // longest side of a picture that has all pixels without zoom
+const LARGE = 1920; // longest side of a picture that is not scaled down
 const MOST = 40; // maximum zoom, in pixels of the screen for a pixel of the video
-const SQUARES = 4; // zoom from which each pixel is a square
-const NEAR = { mouse: 6, touch: 16 }; // pixels of the screen between a pointer and the edge that it drags
-const ROOMY = 24; // minimum side of a box whose edges are dragged, in pixels of the screen
+const SQUARES = 4; // minimum zoom at which pixels are drawn as squares
+const NEAR = { mouse: 6, touch: 16 }; // maximum distance of a pointer from the edge that it drags, in pixels of the screen
+const ROOMY = 24; // minimum side of a box with edges that can be dragged, in pixels of the screen
 const CORNER = 8; // side of the mark of a corner, in pixels of the screen
 
-/** A box is saved as soon as it is drawn. The objects have a `focus`: the box to look at, undefined without one. */
+/** A box is saved as soon as it is drawn. The objects have a `focus`: the box to show, or undefined. */
 export class FrameStage extends Stage {
   constructor(element, objects, actions) {
     super(element, objects, actions);
@@ -25,7 +25,7 @@ export class FrameStage extends Stage {
     return `frames/${frame}.jpg?${query}${full ? "&full" : ""}`.replace(/\?$/, "");
   }
 
-  /** Load and show a picture; with all of its pixels, if it is zoomed. */
+  /** Load and show a picture, in full resolution if it is zoomed. */
   show(picture) {
     picture.full = this.needsAll(picture);
     return super.show(picture);
@@ -41,17 +41,17 @@ export class FrameStage extends Stage {
     return this.zoom * Math.min(clientWidth / width, clientHeight / height);
   }
 
-  /** The part of the frame that is shown, around the place in the middle. */
+  /** The visible part of the frame, around its centre `middle`. */
   get view() {
     const { element: { clientWidth, clientHeight }, middle: [x, y], scale } = this;
     return [x - clientWidth / scale / 2, y - clientHeight / scale / 2, clientWidth / scale, clientHeight / scale];
   }
 
-  /** Zoom by a factor, 0 for the whole picture; a place of the frame stays where it is on the screen, else the middle or the box. */
-  zoomBy(factor, place = null) {
+  /** Zoom by a factor, 0 for the whole picture, around a position in the frame, by default the visible box or the centre. */
+  zoomBy(factor, position = null) {
     if (!this.picture) return;
-    if (!place && this.shows(centre(this.objects.focus))) this.middle = centre(this.objects.focus);
-    const { zoom, scale, middle } = this, [x, y] = place ?? middle;
+    if (!position && this.shows(centre(this.objects.focus))) this.middle = centre(this.objects.focus);
+    const { zoom, scale, middle } = this, [x, y] = position ?? middle;
     this.zoom = Math.max(1, Math.min(zoom * factor, MOST * zoom / scale));
     this.middle = [x + (middle[0] - x) * zoom / this.zoom, y + (middle[1] - y) * zoom / this.zoom];
     if (this.needsAll(this.picture) && !this.picture.full) this.show(this.picture);
@@ -64,16 +64,17 @@ export class FrameStage extends Stage {
     this.draw();
   }
 
-  /** Move the picture so that the box to look at is in it. */
+  /** Move the picture so that the focus is visible. */
   reveal() {
-    const place = centre(this.objects.focus);
-    if (place && !this.shows(place)) this.middle = place;
+    const position = centre(this.objects.focus);
+    if (position && !this.shows(position)) this.middle = position;
     this.draw();
   }
 
-  shows(place) {
-    const [left, top, width, height] = this.view;
-    return Boolean(place) && place[0] >= left && place[0] <= left + width && place[1] >= top && place[1] <= top + height;
+  shows(position) {
+    if (!position) return false;
+    const [left, top, width, height] = this.view, [x, y] = position;
+    return x >= left && x <= left + width && y >= top && y <= top + height;
   }
 
   wheel(event) {
@@ -81,13 +82,13 @@ export class FrameStage extends Stage {
     if (!this.picture || (this.zoom === 1 && (deltaY >= 0 || event.shiftKey))) return; // the page scrolls
     event.preventDefault();
     if (event.shiftKey || Math.abs(deltaX) > Math.abs(deltaY)) this.moveBy(-unit * (deltaX || deltaY), 0);
-    else this.zoomBy(2 ** Math.max(-1, Math.min(1, -deltaY * unit / (ctrlKey ? 60 : 400))), this.point(event)); // a pinch has small steps
+    else this.zoomBy(2 ** Math.max(-1, Math.min(1, -deltaY * unit / (ctrlKey ? 60 : 400))), this.point(event)); // a pinch gesture has small steps
   }
 
-  /** Start with a finger, mouse or pen: the first one draws. Two fingers, the middle button and the space bar move the picture. */
+  /** The first pointer draws; two fingers, the middle button or the space bar move the picture. */
   press(event) {
     const moves = event.button === 1 || this.grabs;
-    if (!this.picture || (this.pointer !== null && !this.hands.has(this.pointer))) return; // a palm beside a pen
+    if (!this.picture || (this.pointer !== null && !this.hands.has(this.pointer))) return; // a palm next to a pen
     if (event.pointerType === "touch" || moves) this.hands.set(event.pointerId, event);
     this.moving ||= moves || this.hands.size > 1;
     if (!this.moving) {
@@ -104,18 +105,18 @@ export class FrameStage extends Stage {
       this.showCursor(this.edgesAt(event));
       super.drag(event);
     } else if (this.isMoved(event)) {
-      // Step 1: The edges that were pressed move as far as the pointer did.
-      const { across, down, box: { x, y, w, h } } = this.edges, place = this.place(event);
-      const [right, below] = [place.x - this.start.x, place.y - this.start.y];
+      // Step 1: Move the dragged edges by the movement of the pointer.
+      const { across, down, box: { x, y, w, h } } = this.edges, position = this.position(event);
+      const [right, below] = [position.x - this.start.x, position.y - this.start.y];
       const columns = [x + (across < 0) * right, x + w + (across > 0) * right].sort((one, other) => one - other);
       const rows = [y + (down < 0) * below, y + h + (down > 0) * below].sort((one, other) => one - other);
-      // Step 2: The box is between them, also if one edge has passed the other.
+      // Step 2: Set the box between the edges, which may have passed each other.
       this.begin();
       this.set(columns[0], rows[0], columns[1] - columns[0], rows[1] - rows[0]);
     }
   }
 
-  /** Move and zoom the picture with the pointers that hold it. */
+  /** Move and zoom the picture with its pointers. */
   grab(event) {
     const [[x, y], size] = span(this.hands), at = this.point({ clientX: x, clientY: y });
     this.hands.set(event.pointerId, event);
@@ -131,20 +132,20 @@ export class FrameStage extends Stage {
     else if (!this.before.drawing) this.cancel();
   }
 
-  /** The edges of the box under a pointer: -1 for left or top, 1 for right or bottom. Null if there are none, or in a small box. */
+  /** The edges of the box under a pointer: -1 for left or top, 1 for right or bottom; null without an edge or in a small box. */
   edgesAt(event) {
     const box = this.changeable;
     if (!box) return null;
-    const { x, y } = this.place(event), near = NEAR[event.pointerType] ?? NEAR.mouse;
-    const edge = (place, from, size) => {
+    const { x, y } = this.position(event), near = NEAR[event.pointerType] ?? NEAR.mouse;
+    const edge = (value, from, size) => {
       const reach = Math.min(near / this.scale, size / 4);
-      return Math.abs(place - from) <= reach ? -1 : Math.abs(place - from - size) <= reach ? 1 : place < from || place > from + size ? null : 0;
+      return Math.abs(value - from) <= reach ? -1 : Math.abs(value - from - size) <= reach ? 1 : value < from || value > from + size ? null : 0;
     };
     const [across, down] = [edge(x, box.x, box.w), edge(y, box.y, box.h)];
     return across !== null && down !== null && (across || down) ? { across, down, box } : null;
   }
 
-  /** The box whose edges can be dragged: the one being changed, or that of the chosen object. */
+  /** The box with edges that can be dragged: the box being drawn, or the chosen object's. */
   get changeable() {
     const [x, y, w, h] = this.picture?.boxes[this.objects.chosen] ?? [];
     const box = this.box ?? (x === undefined || this.drawing ? null : { x, y, w, h });
@@ -156,7 +157,7 @@ export class FrameStage extends Stage {
     this.element.style.cursor = this.moving || this.grabs ? "grab" : !edges ? "" : !down ? "ew-resize" : !across ? "ns-resize" : across === down ? "nwse-resize" : "nesw-resize";
   }
 
-  /** Change the box with a key; false if the key does not. */
+  /** Change the box with a key; returns false for other keys. */
   key(event) {
     const { box } = this, by = event.shiftKey ? 10 : 1;
     const arrows = { ArrowLeft: [-by, 0], ArrowRight: [by, 0], ArrowUp: [0, -by], ArrowDown: [0, by] };
@@ -174,7 +175,7 @@ export class FrameStage extends Stage {
     this.set(...box);
   }
 
-  /** Save the box if a key has changed it, and end the drawing. */
+  /** Save the box if it was changed by keys, and end the drawing. */
   leave() {
     return this.changed ? this.save() : this.cancel();
   }
@@ -191,26 +192,26 @@ export class FrameStage extends Stage {
     super.end();
   }
 
-  /** Position of a pointer in the frame, at a border between pixels. */
-  place(event) {
-    const { x, y } = super.place(event);
+  /** Position of a pointer in the frame, rounded to a border between pixels. */
+  position(event) {
+    const { x, y } = super.position(event);
     return { x: Math.round(x), y: Math.round(y) };
   }
 
   point(event) {
-    const { x, y } = super.place(event);
+    const { x, y } = super.position(event);
     return [x, y];
   }
 
   draw() {
     if (!this.picture || !this.element.clientWidth) return;
-    // Step 1: As far as it is zoomed, the picture covers the stage.
+    // Step 1: Limit the centre so that a zoomed picture covers the stage.
     const { width, height } = this.picture, { zoom, scale, image: { style } } = this;
-    const within = (place, size, shown) => (shown < size ? Math.max(shown / 2, Math.min(size - shown / 2, place)) : size / 2);
+    const within = (value, size, shown) => (shown < size ? Math.max(shown / 2, Math.min(size - shown / 2, value)) : size / 2);
     this.middle = [within(this.middle[0], width, this.view[2]), within(this.middle[1], height, this.view[3])];
     style.transform = zoom > 1 ? `translate(${scale * (width / 2 - this.middle[0])}px, ${scale * (height / 2 - this.middle[1])}px) scale(${zoom})` : "";
     style.imageRendering = zoom > 1 && scale * devicePixelRatio >= SQUARES ? "pixelated" : "";
-    // Step 2: The boxes, and the corners of the box whose edges can be dragged.
+    // Step 2: Draw the boxes, and the corners of the box with edges that can be dragged.
     super.draw();
     const box = this.changeable, side = CORNER / scale;
     for (const x of box ? [box.x, box.x + box.w] : []) {
@@ -222,7 +223,7 @@ export class FrameStage extends Stage {
 
 const centre = (box) => box && [box[0] + box[2] / 2, box[1] + box[3] / 2];
 
-/** The place between two pointers, or of the only one, and their distance. */
+/** The midpoint of two pointers, or the position of the only one, and their distance. */
 function span(hands) {
   const [one, other = one] = hands.values();
   const distance = Math.hypot(one.clientX - other.clientX, one.clientY - other.clientY);

@@ -2,7 +2,7 @@
 
 import { StreamPage } from "./stream.js";
 
-const server = { closed: false, silent: null }; // whether it has announced its shutdown; time since which it does not answer
+const server = { closed: false, silent: null }; // whether it has announced its shutdown; start of its silence
 const page = new StreamPage(server);
 let events = null; // the connection to the server, null while the page is hidden
 
@@ -35,7 +35,7 @@ function stop() {
   events = null;
 }
 
-document.addEventListener("visibilitychange", () => { // a browser opens few connections to a server, over all its tabs
+document.addEventListener("visibilitychange", () => { // the tabs of a browser share few connections to a server
   if (document.hidden && !page.stage.drawing) stop();
   else if (!document.hidden && !events) listen();
 });

@@ -1,16 +1,16 @@
-// The list of the objects, one of them chosen, and the form that asks what a drawn box is.
+// The list of the objects, and the form for the role of a drawn box.
 
 import { $, add, Items, write } from "./dom.js";
 
 /** Colour, name, state, score and model of each object, and a button that drops it. */
 export class Objects {
-  /** actions: choose(name) is called if another object is chosen; forget(name) if the button of an object is pressed. */
+  /** actions: choose(name) is called if another object is chosen, forget(name) if the button of an object is pressed. */
   constructor(element, actions) {
     Object.assign(this, { actions, list: [], chosen: null });
     this.items = new Items(element, { make: (name) => this.make(name), fill });
   }
 
-  /** Whether there is nothing to choose: no object, or one without a name. */
+  /** True if there is no choice: without objects, or with a single unnamed object. */
   get single() {
     return this.list.length < 2 && !this.list[0]?.name;
   }
@@ -19,12 +19,12 @@ export class Objects {
     return this.list.find((one) => one.name === name);
   }
 
-  /** The first of object-2, object-3 ... that is no object's name. */
+  /** The first unused name of object-2, object-3 ... */
   get suggestion() {
     for (let number = this.list.length + 1; ; number++) if (!this.get(`object-${number}`)) return `object-${number}`;
   }
 
-  /** Show these objects. If the chosen one is not among them, the first one is chosen, or the one to choose next. */
+  /** Show a list of objects. If the chosen object is not in it, choose the requested or the first one. */
   show(list) {
     this.list = list;
     if (this.next !== undefined && this.get(this.next)) this.choose(this.next);
@@ -70,7 +70,7 @@ function fill({ element, choose, state, model, score, share }, one) {
   write(score, one.score?.toFixed(2) ?? "–");
 }
 
-/** Asks what a drawn box is: a new object with a name, the chosen one, or another one in its place. */
+/** Asks for the role of a drawn box: a new object with a name, the chosen object, or a replacement for it. */
 export class BoxForm {
   /** actions: accept() and cancel() are called if the user confirms or cancels. */
   constructor(objects, { accept, cancel }) {
@@ -91,7 +91,7 @@ export class BoxForm {
     this.offer("new");
   }
 
-  /** Offer the roles that there are for the chosen object. The first object is a new one. */
+  /** Offer the possible roles for the chosen object; the first object is always new. */
   offer(role = this.role.value) {
     const { single, chosen, list } = this.objects;
     const roles = Object.entries({
@@ -110,11 +110,11 @@ export class BoxForm {
     this.name.disabled = this.name.parentElement.hidden = this.role.value !== "new";
   }
 
-  /** Whether a new object has a name that no other has; if not, the browser shows the error. */
+  /** Return true if the name of a new object is unique; otherwise the browser shows the error. */
   check() {
     this.name.value = this.name.value.trim().normalize("NFC");
-    const taken = this.objects.get(this.name.value);
-    this.name.setCustomValidity(taken?.name ? `There is an object ${taken.name} already: use another name.` : "");
+    const existing = this.objects.get(this.name.value);
+    this.name.setCustomValidity(existing?.name ? `There is an object ${existing.name} already: use another name.` : "");
     return this.form.reportValidity();
   }
 

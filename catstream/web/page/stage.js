@@ -9,8 +9,8 @@ const TEXT = 13; // height of a name in pixels of the screen
 
 export class Stage {
   /**
-   * objects: the list of the objects. actions: hold() returns what the box will apply to; follow(box, still) sends the
-   * box; changed(drawing, box) is called whenever the drawing changes.
+   * objects: the list of the objects. actions: freeze() returns the frame of the box; follow(box, still) sends the box;
+   * changed(drawing, box) is called when the drawing changes.
    */
   constructor(element, objects, actions) {
     Object.assign(this, { element, objects, actions });
@@ -19,11 +19,11 @@ export class Stage {
     this.picture = this.box = this.start = this.still = this.pointer = null;
     this.drawing = this.loading = false;
     this.smallest = SMALLEST;
-    this.turn = 0; // number of pipelines shown before
+    this.generation = 0; // number of earlier pipelines
     element.addEventListener("pointerdown", (event) => this.press(event));
     element.addEventListener("pointermove", (event) => this.drag(event));
     element.addEventListener("pointerup", (event) => this.release(event));
-    element.addEventListener("lostpointercapture", (event) => this.abort(event)); // without a release before
+    element.addEventListener("lostpointercapture", (event) => this.abort(event)); // no effect after a release
     element.addEventListener("keydown", (event) => this.key(event));
   }
 
@@ -31,7 +31,7 @@ export class Stage {
   clear() {
     this.cancel(false);
     this.picture = this.next = null;
-    this.turn += 1;
+    this.generation += 1;
     this.image.removeAttribute("src");
     this.boxes.replaceChildren();
   }
@@ -42,12 +42,12 @@ export class Stage {
     if (this.loading) return;
     this.loading = true;
     while (this.next) {
-      const [wanted, turn, image] = [this.next, this.turn, new Image()];
+      const [wanted, generation, image] = [this.next, this.generation, new Image()];
       this.next = null;
       Object.assign(image, { id: this.image.id, alt: "", draggable: false, src: this.url(wanted) });
       const loaded = await image.decode().then(() => true, () => false);
-      // A picture of the previous pipeline is not shown, nor a newer one than that on which a box is drawn.
-      if (!loaded || turn !== this.turn || (this.still && this.still.frame < wanted.frame)) continue;
+      // Skip pictures of the previous pipeline, and pictures newer than the one on which a box is drawn.
+      if (!loaded || generation !== this.generation || (this.still && this.still.frame < wanted.frame)) continue;
       this.image.replaceWith(image);
       [this.picture, this.image] = [wanted, image];
       this.draw();
@@ -59,12 +59,12 @@ export class Stage {
     return `pictures/${time}.jpg?${Date.now()}`;
   }
 
-  /** Hold the picture, and begin to draw a box. */
+  /** Freeze the picture, and begin to draw a box. */
   async begin() {
     if (this.drawing || !this.picture) return;
     this.drawing = true;
-    this.tell();
-    const still = await this.actions.hold();
+    this.notify();
+    const still = await this.actions.freeze();
     if (!still) this.cancel();
     else if (this.drawing) this.still = still;
     else still.leave?.();
@@ -78,7 +78,7 @@ export class Stage {
     const done = await this.actions.follow([x, y, w, h], this.still);
     this.asking = false;
     if (!done) return;
-    const { start } = this; // of the next box: the picture may run again before the answer is here
+    const { start } = this; // of the next box, which may have begun before the answer
     this.end();
     this.start = start;
   }
@@ -93,26 +93,26 @@ export class Stage {
   end() {
     this.drawing = false;
     this.box = this.start = this.still = null;
-    this.tell();
+    this.notify();
   }
 
-  /** Start with the first pointer: others do not draw as long as it is down. */
+  /** Start to draw with the first pointer; further pointers are ignored until it is released. */
   press(event) {
     if (event.button !== 0 || !this.picture || this.pointer !== null) return;
     this.element.setPointerCapture(event.pointerId);
     this.pointer = event.pointerId;
     this.before = { drawing: this.drawing, box: this.box };
-    this.start = { ...this.place(event), screen: [event.clientX, event.clientY] };
+    this.start = { ...this.position(event), screen: [event.clientX, event.clientY] };
   }
 
   drag(event) {
     if (event.pointerId !== this.pointer || !this.start || this.asking || !this.isMoved(event)) return;
     this.begin();
-    const { x, y } = this.place(event);
+    const { x, y } = this.position(event);
     this.set(Math.min(x, this.start.x), Math.min(y, this.start.y), Math.abs(x - this.start.x), Math.abs(y - this.start.y));
   }
 
-  /** True once a pointer has moved so far that it is no click. */
+  /** True once a pointer has moved too far for a click. */
   isMoved({ clientX, clientY }) {
     const [across, down] = this.start.screen;
     return (this.start.moved ||= Math.hypot(clientX - across, clientY - down) >= STILL);
@@ -120,33 +120,33 @@ export class Stage {
 
   release(event) {
     if (event.pointerId !== this.pointer) return;
-    const place = this.start;
+    const { start } = this;
     this.pointer = this.start = null;
-    if (!place) return;
-    if (!this.drawing) this.choose(place);
+    if (!start) return;
+    if (!this.drawing) this.choose(start);
     else if (!this.box || this.box.w < this.smallest || this.box.h < this.smallest) {
       this.box = this.before.box;
-      this.tell();
+      this.notify();
     }
   }
 
-  /** Drop what a pointer has drawn: a second finger zooms, or the browser needs the pointer. */
+  /** Revert the drawing of a pointer, because a second finger zooms or the browser has cancelled the pointer. */
   abort(event) {
     if (event.pointerId !== this.pointer) return;
     this.pointer = this.start = null;
     if (!this.before.drawing) return this.cancel();
     this.box = this.before.box;
-    this.tell();
+    this.notify();
   }
 
-  /** Choose the object whose box contains a place; the smallest one, if there are several. */
+  /** Choose the object with the smallest box that contains a position. */
   choose({ x, y }) {
     const inside = ([, [left, top, w, h]]) => x >= left && x <= left + w && y >= top && y <= top + h;
-    const found = this.shown.filter(inside).sort(([, one], [, other]) => one[2] * one[3] - other[2] * other[3]);
-    if (found.length) this.objects.choose(found[0][0]);
+    const hits = this.shown.filter(inside).sort(([, one], [, other]) => one[2] * one[3] - other[2] * other[3]);
+    if (hits.length) this.objects.choose(hits[0][0]);
   }
 
-  /** The boxes of the picture, by name; without dropped objects, the chosen one last. */
+  /** The boxes of the picture by name, without dropped objects, the chosen object last. */
   get shown() {
     const boxes = Object.entries(this.picture?.boxes ?? {}).filter(([name]) => this.objects.get(name));
     return boxes.sort(([name], [other]) => (name === this.objects.chosen) - (other === this.objects.chosen));
@@ -176,17 +176,17 @@ export class Stage {
     const { width, height } = this.picture;
     [w, h] = [Math.min(w, width), Math.min(h, height)];
     this.box = { x: Math.max(0, Math.min(x, width - w)), y: Math.max(0, Math.min(y, height - h)), w, h };
-    this.tell();
+    this.notify();
   }
 
   /** Position of a pointer in the frame. */
-  place(event) {
+  position(event) {
     const { x, y } = new DOMPoint(event.clientX, event.clientY).matrixTransform(this.boxes.getScreenCTM().inverse());
-    const inside = (value, most) => Math.max(0, Math.min(most, value));
-    return { x: inside(x, this.picture.width), y: inside(y, this.picture.height) };
+    const clamp = (value, most) => Math.max(0, Math.min(most, value));
+    return { x: clamp(x, this.picture.width), y: clamp(y, this.picture.height) };
   }
 
-  tell() {
+  notify() {
     this.actions.changed(this.drawing, this.box);
     this.draw();
   }
@@ -196,7 +196,7 @@ export class Stage {
     return [0, 0, this.picture.width, this.picture.height];
   }
 
-  /** Draw the box of each object with its name, and the box of the user, over a darker picture. */
+  /** Draw the box of each object with its name, or shade the picture and draw the user's box. */
   draw() {
     if (!this.picture) return;
     const { width, height } = this.picture;
@@ -217,7 +217,7 @@ export class Stage {
     for (const stroke of ["#000b", colour]) this.boxes.append(make("rect", { class: thick ? "thick" : "", x, y, width, height, stroke }));
   }
 
-  /** Write a name above a box, or below its upper side if there is no room. */
+  /** Write a name above the top edge of a box, or below it at the top of the picture. */
   label([x, y], name, colour) {
     const size = TEXT / (this.boxes.getScreenCTM()?.a || 1);
     const text = make("text", { "font-size": size, x: 0.4 * size, y: 1.05 * size }, name);

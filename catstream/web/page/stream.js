@@ -6,12 +6,12 @@ import { BoxForm, Objects } from "./objects.js";
 import { Stage } from "./stage.js";
 import { Trees } from "./trees.js";
 
-const PAUSE = { seconds: 30, renewed: 10_000 }; // of the pipeline while a box is drawn; milliseconds until it is renewed
+const PAUSE = { seconds: 30, renewed: 10_000 }; // timeout of the pause while a box is drawn; milliseconds until it is renewed
 const TONES = { lost: "silent", starting: "waiting" };
-const MESSAGE = 9000; // milliseconds that a message is shown about which nothing has to be done
+const MESSAGE = 9000; // milliseconds for which an informational message is shown
 
 export class StreamPage {
-  /** server: {closed, silent}, whether it has announced its shutdown, and the time since which it does not answer. */
+  /** server: {closed, silent}, whether it has announced its shutdown, and the start of its silence. */
   constructor(server) {
     this.server = server;
     this.name = decodeURIComponent(location.pathname).match(/\/streams\/([^/]+)\/$/)?.[1] ?? ""; // empty if there is one stream
@@ -20,7 +20,7 @@ export class StreamPage {
     this.trees = new Trees($(".trees"), $("#tree-summary"));
     this.objects = new Objects($(".objects"), { choose: (name) => this.showChosen(name), forget: (name) => this.forget(name) });
     this.form = new BoxForm(this.objects, { accept: () => this.stage.accept(), cancel: () => this.stage.cancel() });
-    this.stage = new Stage($("#stage"), this.objects, { hold: () => this.hold(), follow: (box, still) => this.follow(box, still),
+    this.stage = new Stage($("#stage"), this.objects, { freeze: () => this.freeze(), follow: (box, still) => this.follow(box, still),
       changed: (drawing, box) => this.showDrawing(drawing, box) });
     $("#all").hidden = !this.name;
     this.listen();
@@ -34,12 +34,12 @@ export class StreamPage {
     $("#stop").onclick = () => {
       if (confirm("Stop the pipeline?\n\nEverything learned is stored first. The pipeline cannot be restarted from this page.")) this.send("stop");
     };
-    addEventListener("pagehide", () => this.stage.cancel()); // else the pipeline resumes only once its pause is over
+    addEventListener("pagehide", () => this.stage.cancel()); // otherwise the pipeline resumes only after the timeout of its pause
     const sizes = new ResizeObserver(() => { this.stage.draw(); this.charts.draw(); this.trees.show(); });
     for (const drawn of [$("#stage"), $(".charts"), $(".trees")]) sizes.observe(drawn);
   }
 
-  /** Show the parts that have changed; `pipeline` is sent, with all of them, if all that was shown is of another one. */
+  /** Show changed parts; `pipeline` is sent, with all parts, if they are of another pipeline. */
   take({ pipeline, status, tracks, picture, points, trees }) {
     if (pipeline !== undefined) this.clear();
     if (status) {
@@ -63,7 +63,7 @@ export class StreamPage {
     this.showMessage("");
   }
 
-  /** Send a command; returns the answer, or null if it was rejected, after showing the reason. */
+  /** Send a command; returns the answer, or null after showing the reason of a rejection. */
   async send(verb, fields = {}) {
     const answer = await post("control", { verb, ...fields });
     this.showMessage(answer.reason, !answer.done);
@@ -71,13 +71,13 @@ export class StreamPage {
   }
 
   /**
-   * Hold the picture for drawing a box. A live source goes on: the box will apply to the frame at the time of the picture.
-   * A file is paused; returns the frame that the box will apply to, and the function that resumes. The pause ends by
-   * itself if this page does not renew it. Another pause, which the user or another program has begun, stays.
+   * Freeze the picture for drawing a box. A live source continues: the box applies to the frame at the time of the picture.
+   * A file is paused; returns the frame of the box, and a function that resumes. The pause has a timeout, which this page
+   * renews. A pause by the user or another program is not resumed.
    */
-  async hold() {
+  async freeze() {
     if (this.isLive) return { frame: -1, time: this.stage.picture.time, leave: null };
-    await this.left; // the pause of a box that was cancelled just now
+    await this.left; // the end of the previous pause
     if (this.status.state === "waiting") return { frame: Infinity, leave: null };
     const answer = await this.send("pause", { seconds: PAUSE.seconds });
     if (!answer) return null;
@@ -87,20 +87,20 @@ export class StreamPage {
       clearInterval(this.renewing);
       return (this.left = this.send("pause", { seconds: 0 }));
     };
-    // A paused pipeline holds the frame after the last tracked one; the box applies to that frame.
+    // A paused pipeline waits with the frame after the last tracked one, to which the box applies.
     return { frame: answer.frame + 1, leave };
   }
 
-  /** Renew the pause, unless the pipeline has continued after this frame: the picture is another one by then. */
+  /** Renew the pause; if the pipeline has continued after this frame, cancel the drawing on the old picture. */
   async renew(frame) {
     const answer = await post("control", { verb: "pause", seconds: PAUSE.seconds });
     if (!answer.done || answer.frame === frame || !this.stage.drawing || this.stage.asking) return;
     this.stage.cancel();
     await this.left;
-    this.showMessage("The pipeline has continued meanwhile: draw the box again.", true);
+    this.showMessage("The pipeline has continued: draw the box again.", true);
   }
 
-  /** Send the box, as that of a new object or of the chosen one. */
+  /** Send the box of a new or of the chosen object. */
   async follow(box, { time, leave }) {
     if (!this.form.check()) return false;
     const answer = await this.send("set-box", { ...this.form.fields, time, box: box.map((side) => Math.round(side * 10) / 10) });
@@ -120,7 +120,7 @@ export class StreamPage {
     }
   }
 
-  /** Show a message until the next one, or only for some seconds. */
+  /** Show a message until the next one, or for some seconds. */
   showMessage(text, wrong = false, fades = !wrong) {
     const message = $("#message");
     message.textContent = text;
@@ -145,7 +145,7 @@ export class StreamPage {
     this.showObjects();
   }
 
-  /** Show the list, unless the only object has no name. */
+  /** Show the list, unless there is a single unnamed object. */
   showObjects() {
     const { single, chosen } = this.objects;
     $("#objects").hidden = single;
@@ -164,18 +164,18 @@ export class StreamPage {
     this.showSource();
     write($("#overlay"), this.overlay());
     $("#stage").classList.toggle("over", Boolean(stage.picture) && (status.phase === "ended" || status.state === "lost"));
-    $("#draw").classList.toggle("main", state === "waiting" || state === "absent"); // else there is no need of one
+    $("#draw").classList.toggle("main", state === "waiting" || state === "absent"); // highlight it if a box is needed
     write($("#pause"), status.paused ? "Resume" : "Pause");
     $("#pause").setAttribute("aria-pressed", String(status.paused));
     for (const button of [$("#draw"), $("#pause"), $("#stop")]) button.disabled = !running;
   }
 
-  /** Whether the source is live: the detector counts frames that it skips. */
+  /** True if the source is live: then the detector counts skipped frames. */
   get isLive() {
     return (this.status.skipped ?? null) !== null;
   }
 
-  /** The state of the pipeline for its colour, and in words. */
+  /** The state of the pipeline: a name for its colour, and a description. */
   state(running) {
     const { status, server, objects: { list } } = this;
     if (server.silent !== null && status.phase !== "ended") return ["silent", "page stopped"];
@@ -186,7 +186,7 @@ export class StreamPage {
     return [state, words];
   }
 
-  /** The name of the source; its whole address and the endpoint of the pipeline as the tooltip. */
+  /** Show the name of the source; the tooltip has its address and the endpoint of the pipeline. */
   showSource() {
     const { source = "", endpoint, skipped } = this.status;
     const last = source.includes("://") ? source : source.split("/").filter(Boolean).at(-1) || source;
@@ -196,7 +196,7 @@ export class StreamPage {
     document.title = shown ? `${this.name || shown} – catstream` : "catstream";
   }
 
-  /** Text over the picture: the reason why it does not change. */
+  /** Text over the picture: the reason if it does not change. */
   overlay() {
     const { status, stage, server: { closed, silent } } = this;
     if (status.phase === "ended") {
