@@ -1,8 +1,7 @@
-"""A stream of a fleet: one pipeline on this node, its state in the store, and what the controller asks for.
+"""A stream of a fleet: runs a pipeline on this node, stores its state, and reports to the controller.
 
-A `Stream` has nothing of Ray in it; `catstream.fleet.controller` makes an actor of it. Its pipeline runs in a thread of
-its own, and is started again after a failure. Its state is stored by another thread, so that a slow store does not stop
-the tracks.
+A `Stream` does not depend on Ray; `catstream.fleet.controller` makes it an actor. Its pipeline runs in a thread, and is
+restarted after a failure. A second thread stores its state, so a slow store does not delay the tracks.
 """
 
 from __future__ import annotations
@@ -40,22 +39,22 @@ from catstream.wire.keys import Client, ensure, public_key, synchronise
 from catstream.wire.messages import StreamState, StreamStatus, Track
 from catstream.wire.storage import Metadata
 
-FIRST_PAUSE_SECONDS = 1.0  # before a stream that failed starts again; doubled each time
-LONGEST_PAUSE_SECONDS = 60.0  # the most of these; after so long without a failure, it is the first one again
-_TRACKS_SECONDS = 0.1  # longest wait for a frame
-_CHECK_SECONDS = 5.0  # between two checks of the claim if `every` is 0
-_STORE_RATE = 0.1e6  # bytes per second that are stored then: 9 GB a day
+FIRST_PAUSE_SECONDS = 1.0  # initial pause of the exponential backoff before a restart
+LONGEST_PAUSE_SECONDS = 60.0  # maximum pause; after this time without a failure, the pause is reset
+_TRACKS_SECONDS = 0.1  # timeout for a frame
+_CHECK_SECONDS = 5.0  # interval between two checks of the claim if `every` is 0
+_STORE_RATE = 0.1e6  # limit in bytes per second if `every` is 0: 9 GB a day
 
 _log = logging.getLogger(__name__)
 
 
 class Stream:
-    """Runs the pipeline of one stream until it ends or is stopped, and stores its state again and again.
+    """Runs the pipeline of one stream until it ends or is stopped, and stores its state periodically.
 
     node     id of its node
-    address  IP address at which other machines reach its sockets; empty if all clients are on this machine
-    clients  the clients that may connect, by name, if there is an address
-    every    seconds between two states in the store; 0 for an interval that grows with their size
+    address  IP address of its sockets for other machines; empty if all clients are on this machine
+    clients  clients that may connect, by name, if there is an address
+    every    interval in seconds between two states in the store; 0 for an interval that grows with their size
     """
 
     def __init__(
@@ -68,11 +67,11 @@ class Stream:
         source = without_password(spec.source)
         self._status = StreamStatus(spec.name, "starting", node, source, live=is_live(spec.source))
         self._stop, self._lock = threading.Event(), threading.Lock()
-        self._stored_at = 0.0  # seconds since 1970 at which the state was that in the store
+        self._stored_at = 0.0  # Unix time at which the state in the store was current
         self._failure = self._store_trouble = self._pipeline_trouble = ""
         self._superseded = self._has_tracked = False
-        self._files: set[tuple[Path, int]] = set()  # of the state that was stored last, with their times
-        self._due = 0.0  # time at which the next state is stored
+        self._files: set[tuple[Path, int]] = set()  # files of the last stored state, with their modification times
+        self._next_write = 0.0  # time from which the next state is stored
         self._stack = ExitStack()
         self._folder = self._stack.enter_context(private_folder())
         self._keys = self._folder / "keys"
@@ -80,9 +79,9 @@ class Stream:
         self._thread.start()
 
     def report(self, clients: dict[str, Client] | None = None) -> tuple[StreamStatus, bool]:
-        """The state of the stream now, and whether it ended because another process has claimed it.
+        """The state of the stream, and whether it ended because another process has claimed it.
 
-        From now on, only these clients may connect.
+        Sets the clients that may connect from now on.
         """
         with self._lock:
             if clients is not None and clients != self._clients:
@@ -94,31 +93,31 @@ class Stream:
             return replace(self._status, stored_seconds=stored, trouble="; ".join(troubles)), self._superseded
 
     def stop(self) -> str:
-        """End the pipeline, and store its last state; returns why it could not be stored, or nothing."""
+        """End the pipeline, and store its last state; returns the error of storing it, or ""."""
         self._stop.set()
         self._thread.join()
         self._stack.close()
         return self._store_trouble
 
     def _run(self) -> None:
-        """Run the pipeline, again after each failure, until the stream ends, is stopped, or is superseded."""
+        """Run the pipeline until the stream ends, is stopped, or is superseded; restart it after each failure."""
         pause = FIRST_PAUSE_SECONDS
         while not self._stop.is_set():
             began = time.monotonic()
             try:
                 self._run_once()
                 return
-            except StoreError as error:  # the claim: nothing has begun
+            except StoreError as error:  # the claim failed, so the pipeline was not started
                 self._store_trouble = str(error)
-            except Exception as error:  # the controller has to see it
+            except Exception as error:  # must be reported to the controller
                 _log.warning("%s failed", self._spec.name, exc_info=not isinstance(error, CatstreamError))
                 with self._lock:
                     is_known = isinstance(error, CatstreamError)
                     self._failure = str(error) if is_known else f"{type(error).__name__}: {error}"
                     self._pipeline_trouble = ""
                     self._status = replace(self._status, state="failed", endpoint="", present={})
-                if self._has_tracked:  # what it has learned since the last state
-                    self._due = 0.0
+                if self._has_tracked:  # the state has changed
+                    self._next_write = 0.0
                     self._write()
             pause = FIRST_PAUSE_SECONDS if time.monotonic() - began > LONGEST_PAUSE_SECONDS else pause
             self._stop.wait(pause)
@@ -126,10 +125,11 @@ class Stream:
 
     def _run_once(self) -> None:
         """Claim the stream, and run the pipeline from the state in the store, or from the start."""
+        # Step 1: claim the stream, and return if it has ended.
         self._store = Store(self._url)
         claim = self._claim = self._store.stream(self._spec.name).claim()
         self._store_trouble = ""
-        shutil.rmtree(self._folder / "state", ignore_errors=True)  # of the run before a failure
+        shutil.rmtree(self._folder / "state", ignore_errors=True)  # of a failed run
         self._has_tracked, self._files, ended = False, set(), False
         facts: Metadata = claim.state.facts if claim.state is not None else {}
         if claim.state is not None and facts["ended"]:
@@ -138,7 +138,8 @@ class Stream:
                     self._stored_at = float(facts["time"])
                     self._status = replace(self._status, state="ended", frame=int(facts["frame"]))
                 return
-            claim.state, facts = None, {}  # it was changed since: it begins again
+            claim.state, facts = None, {}  # the spec has changed, so the stream begins again
+        # Step 2: start the pipeline.
         with ExitStack() as stack:
             source, state = self._spec.source, self._folder / "state"
             settings = self._spec.settings | self._sockets(stack)
@@ -149,7 +150,7 @@ class Stream:
                 pipeline = Pipeline(source, settings=settings, resume=state)
             outputs, resume = None, claim.state is not None
             files = self._destinations(pipeline, resume=resume)
-            closed_last = stack.enter_context(ExitStack())  # after the processes
+            closed_last = stack.enter_context(ExitStack())  # closed after the processes
             stack.enter_context(pipeline)
             with self._lock:
                 self._failure = ""
@@ -161,17 +162,18 @@ class Stream:
             self._change_objects(pipeline, facts)
             over = threading.Event()
             storing = threading.Thread(target=self._keep_storing, args=(over,), name="store")
-            storing.daemon = True  # a store that hangs must not keep the process
+            storing.daemon = True  # a store that hangs must not keep the process alive
             storing.start()
             stack.callback(storing.join)
             stack.callback(over.set)
+            # Step 3: receive the tracks and write them.
             for tracks in pipeline.by_frame(_TRACKS_SECONDS):
-                self._take(pipeline, tracks, outputs)
+                self._update_status(pipeline, tracks, outputs)
                 if tracks and files.destinations:
                     if outputs is None:
                         outputs = files.continued(pipeline.endpoint, resume=resume)
                         closed_last.enter_context(outputs)
-                        stack.callback(outputs.end)  # before the processes, and before the store
+                        stack.callback(outputs.end)  # called before the processes and the store are closed
                     outputs.write(TrackedFrame([*tracks.values()]))
                     pipeline.report_unwritten(outputs.not_written, outputs.trouble)
                 elif outputs is not None:
@@ -183,7 +185,7 @@ class Stream:
         self._write_last(ended=ended)
 
     def _write_last(self, *, ended: bool) -> None:
-        """Store the last state. A stream has ended once that is done, so it is tried again until it is."""
+        """Store the last state, which ends the stream; this is retried until it succeeds."""
         while not self._superseded:
             self._write(is_last=True, ended=ended)
             if not self._store_trouble:
@@ -194,7 +196,7 @@ class Stream:
                 return
 
     def _destinations(self, pipeline: Pipeline, *, resume: bool) -> RunFiles:
-        """The destinations of the tracks. If this node has a log, the run continues its frame numbers."""
+        """The destinations of the tracks. If a log exists on this node, the run continues its frame numbers."""
         options = self._spec.options
         check_zones(options.zone, pipeline.size)
         origin = Origin(pipeline.header, Address(keys=pipeline.settings.run.keys), options)
@@ -204,7 +206,7 @@ class Stream:
         return files
 
     def _sockets(self, stack: ExitStack) -> dict[str, object]:
-        """The settings of the sockets: in a private folder, or on ports of this node with keys made here."""
+        """The settings of the sockets: in a private folder, or on ports of this node with new keys."""
         if not self._address:
             return {"run.endpoint": "", "run.keys": ""}
         with self._lock:
@@ -216,16 +218,16 @@ class Stream:
         }
 
     def _change_objects(self, pipeline: Pipeline, facts: Metadata) -> None:
-        """Begin the objects that the spec has now and had not when the state was made, and forget the others."""
+        """Begin the objects that were added to the spec since the state was stored, and forget removed ones."""
         boxes, models = self._spec.boxes, self._spec.models
-        before = set(facts["objects"]) if facts else set(boxes)
-        begin, search = sorted(boxes.keys() - before), sorted(models.keys() - before)
-        forget = sorted(before - boxes.keys() - models.keys())
+        previous = set(facts["objects"]) if facts else set(boxes)
+        begin, search = sorted(boxes.keys() - previous), sorted(models.keys() - previous)
+        forget = sorted(previous - boxes.keys() - models.keys())
         with control(Address(pipeline.endpoint, keys=pipeline.settings.run.keys)) as controlled:
             for name in begin:
                 controlled.set_box(boxes[name], name)
             for name in forget:
-                with suppress(CommandRejectedError):  # it was forgotten already
+                with suppress(CommandRejectedError):  # already forgotten
                     controlled.forget(name)
             for name in search:
                 model = self._store.model(self._spec.name, name).newest()
@@ -235,8 +237,8 @@ class Stream:
                     SavedModel.from_bytes(model.files["model"], f"the model of {name!r} in the store"), name
                 )
 
-    def _take(self, pipeline: Pipeline, tracks: dict[str, Track], outputs: OpenFiles | None) -> None:
-        """Take the tracks of a frame, none if none has arrived for a while, and count what the destinations lack."""
+    def _update_status(self, pipeline: Pipeline, tracks: dict[str, Track], outputs: OpenFiles | None) -> None:
+        """Update the status with the tracks of a frame, which are empty if no frame has arrived for a while."""
         troubles = [f"{process}: {trouble}" for process, trouble in pipeline.trouble.items()]
         if pipeline.lost_seconds:
             troubles.append(f"its source has been lost for {pipeline.lost_seconds:.0f} s")
@@ -255,14 +257,14 @@ class Stream:
             self._pipeline_trouble = "; ".join(troubles)
 
     def _keep_storing(self, over: threading.Event) -> None:
-        """Store the state again and again until the pipeline is over, or another process has claimed the stream."""
+        """Store the state periodically until the pipeline is over, or another process has claimed the stream."""
         while not over.wait(self._every) and not self._superseded:
             self._write()
 
     def _write(self, *, is_last: bool = False, ended: bool = False) -> None:
-        """Store the newest checkpoint if it is due, and what was commanded at once; check the claim in any case.
+        """Store the state after commands or once its interval has elapsed; always check the claim.
 
-        A failure is a trouble; a newer claim ends the stream.
+        Errors are reported as trouble; a newer claim ends the stream.
         """
         state, trouble, now = self._folder / "state", "", time.time()
         facts: Metadata = {
@@ -275,22 +277,22 @@ class Stream:
         try:
             versions = {(path, path.stat().st_mtime_ns) for path in state.rglob("*.*") if path.is_file()}
             was_commanded = any(path.name == DESIRED for path, _ in versions - self._files)
-            is_due = is_last or was_commanded or time.monotonic() >= self._due
+            is_urgent = is_last or was_commanded or time.monotonic() >= self._next_write
             if versions == self._files and not is_last:
                 self._claim.check()
                 self._stored_at = now
-            elif is_due and (content := files(state)):
+            elif is_urgent and (content := files(state)):
                 self._claim.write(content, facts)
                 self._files, self._stored_at = versions, now
-                self._due = time.monotonic() + sum(map(len, content.values())) / self._rate
-            else:  # not due, or no checkpoint yet
+                self._next_write = time.monotonic() + sum(map(len, content.values())) / self._rate
+            else:  # too early, or no checkpoint yet
                 self._claim.check()
         except FencedError as error:
             _log.warning("%s: %s", self._spec.name, error)
             self._superseded = True
             self._stop.set()
         except FileNotFoundError:
-            pass  # a newer checkpoint has just taken its place: the next turn stores it
+            pass  # a newer checkpoint has just replaced it: the next iteration stores it
         except (ServiceError, OSError) as error:
             trouble = f"its state cannot be stored: {error}"
         with self._lock:

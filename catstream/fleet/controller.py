@@ -1,10 +1,10 @@
-"""The controller of a fleet: an actor of Ray that compares the desired streams with the running actors.
+"""The controller of a fleet: a Ray actor that reconciles the running actors with the desired streams.
 
-The desired streams are in the store, and actors have names, so a controller that Ray starts again finds both, and
-touches no stream that runs. Ray places a stream, and starts it again elsewhere if its process or its node
-dies. One thread looks at the actors twice a second, and answers the registry in between; calls from
-`catstream.fleet.fleet` come in threads of Ray. Only these use the store, so a store that hangs delays nothing but the
-change that waits for it. A change is stored before it is answered.
+The desired streams are in the store, and actors are named, so a controller that Ray restarts finds both, and does not
+touch running streams. Ray schedules a stream, and restarts it elsewhere if its process or its node dies. One thread
+reconciles the actors twice a second, and answers the registry in between; calls from `catstream.fleet.fleet` are
+executed in threads of Ray. Only these calls use the store, so a store that hangs delays only the change that waits for
+it. A change is stored before it is answered.
 """
 
 from __future__ import annotations
@@ -34,25 +34,25 @@ NAMESPACE = "catstream"
 #: Contents of saved models, by stream and object.
 Models = dict[tuple[str, str], bytes]
 
-_TURN_SECONDS = 0.5  # between two looks at the actors
-_WAIT_SECONDS = 0.1  # longest wait of a look for the reports of all streams, and for a question to the registry
-_GOODBYE_SECONDS = 2.0  # for clients, which ask every second, to learn that there is no stream any more
-_PAUSE_SECONDS = 5.0  # between two starts of one actor, at least: one may die each time, or be superseded
-SILENT_SECONDS = 120.0  # without an answer, after which a stream is started again: a busy machine may be slow to answer
-STOPPING_SECONDS = 30.0  # limit for a stream to store its last state and to end, before it is killed
-QUIET_SECONDS = 5.0  # without an answer of a stream, after which the status says so
-PLACED_SECONDS = 15.0  # for Ray to place and start a stream, after which the status says that it has not
+_RECONCILE_SECONDS = 0.5  # interval between two comparisons of actors and desired streams
+_WAIT_SECONDS = 0.1  # timeout for the reports of all streams, and for a question to the registry
+_GOODBYE_SECONDS = 2.0  # time for clients, which ask every second, to learn that all streams have ended
+_PAUSE_SECONDS = 5.0  # minimum interval between two starts of an actor, which may die or be superseded each time
+SILENT_SECONDS = 120.0  # timeout for an answer, after which a stream is restarted; long, as the machine may be busy
+STOPPING_SECONDS = 30.0  # timeout for a stream to store its last state and to end, after which it is killed
+QUIET_SECONDS = 5.0  # time without an answer of a stream after which the status reports it
+PLACED_SECONDS = 15.0  # time for Ray to schedule and start a stream, after which the status reports a delay
 
 _log = logging.getLogger(__name__)
 
 
 class StreamActor(Stream):
-    """A stream as an actor of Ray, which tells the stream where it was placed."""
+    """A stream as a Ray actor, with the node and address where Ray has scheduled it."""
 
     def __init__(self, spec: StreamSpec, clients: dict[str, Client] | None, store: str, every: float) -> None:
         import ray
 
-        die_with(os.getppid())  # Ray's raylet, without which nothing watches the stream
+        die_with(os.getppid())  # Ray's raylet, which supervises the stream
         node = ray.get_runtime_context().get_node_id()
         address = "" if clients is None else ray.util.get_node_ip_address()
         super().__init__(spec, node, address, clients or {}, store, every)
@@ -60,18 +60,18 @@ class StreamActor(Stream):
 
 @dataclass(slots=True)
 class Actor:
-    """The actor of a stream, as its controller sees it.
+    """The controller's record of the actor of a stream.
 
-    handle    of Ray; None if there is no actor
-    order     `StreamSpec.order` with which it was started: a part of its name
-    started   moment of its last start
-    since     moment at which Ray began to place it, or it was told to stop
-    answered  moment of its last answer
-    node      id of the node that it reported from; "" while Ray places and starts it
-    status    its last report; None before the first one
-    stops     whether it was told to stop, or was killed
-    ended     `StreamSpec.digest` with which its source has ended; "" if it has not
-    call      the call for the next report, or that stops it, which was not answered yet
+    handle    Ray's handle; None if there is no actor
+    order     `StreamSpec.order` at its start, a part of its name
+    started   time of its last start
+    since     time at which Ray began to schedule it, or at which it was stopped
+    answered  time of its last answer
+    node      id of the node in its last report; "" while Ray schedules and starts it
+    status    last report; None before the first one
+    stops     whether it is being stopped or was killed
+    ended     `StreamSpec.digest` of the stream whose source has ended; "" if it has not
+    call      pending call for a report or to stop it
     """
 
     handle: Any = None
@@ -87,10 +87,10 @@ class Actor:
 
 
 class Controller:
-    """Runs as one actor of a fleet; the methods without an underscore are called by `catstream.fleet.fleet`.
+    """An actor of each fleet; `catstream.fleet.fleet` calls its public methods.
 
     listen  tcp://HOST:PORT at which the registry listens, or the folder of its Unix socket
-    keys    folder of the keys of the clients; empty if all are on this machine
+    keys    folder of the keys of the clients; empty if all clients are on this machine
     """
 
     def __init__(self, name: str, store: str, listen: str, keys: str) -> None:
@@ -98,15 +98,15 @@ class Controller:
         self._name, self._listen, self._store = name, listen, Store(store)
         self._keys = Path(keys).expanduser() if keys else None
         self._spec = FleetSpec(name, store)
-        self._trouble: CatstreamError | None = None  # why it has not begun
-        self._changing = threading.Lock()  # held by a change while it is stored
-        self._lock = threading.RLock()  # of what follows, held for moments only
-        self._nodes: list[dict[str, Any]] = []  # as Ray describes them
+        self._trouble: CatstreamError | None = None  # error of `_begin`
+        self._changing = threading.Lock()  # locked while a change is stored
+        self._lock = threading.RLock()  # for the following attributes, locked only briefly
+        self._nodes: list[dict[str, Any]] = []  # in Ray's format
         self._actors: dict[str, Actor] = {}
         self._clients: dict[str, Client] | None = None if self._keys is None else {}
-        self._phase: Literal["idle", "up", "down"] = "idle"  # before the first change; and while the fleet ends
-        self._unstored: dict[str, str] = {}  # why the last state of a stream that has stopped is not stored
-        self._last_question = float("-inf")  # when a client of the registry has asked last
+        self._phase: Literal["idle", "up", "down"] = "idle"  # idle before the first change, down while the fleet ends
+        self._unstored: dict[str, str] = {}  # errors of storing the last state of stopped streams
+        self._last_question = float("-inf")  # time of the last question to the registry
         self._over = threading.Event()
         self._registry: RegistryServer | None = None
         try:
@@ -117,20 +117,20 @@ class Controller:
         self._thread.start()
 
     def ready(self) -> None:
-        """Return if it has begun; raise CatstreamError if its address is in use, or its store cannot be read."""
+        """Raise CatstreamError if its address is in use, or its store cannot be read."""
         if self._trouble is not None:
             raise self._trouble
 
     def apply(self, spec: FleetSpec, models: Models) -> list[str]:
-        """Let these streams run, and no others; returns what will be done, a line for each stream."""
+        """Set the desired streams; returns a line for each stream with its change."""
         return self._change(lambda _: spec, models)
 
     def add(self, stream: StreamSpec, models: Models) -> list[str]:
-        return self._change(lambda before: replace(before, streams=before.streams | {stream.name: stream}), models)
+        return self._change(lambda spec: replace(spec, streams=spec.streams | {stream.name: stream}), models)
 
     def remove(self, names: tuple[str, ...]) -> list[str]:
-        """Remove streams; their states stay."""
-        return self._change(lambda before: replace(before, streams=before.without(names)))
+        """Remove streams, but not their states."""
+        return self._change(lambda spec: replace(spec, streams=spec.without(names)))
 
     def status(self) -> FleetStatus:
         with self._lock:
@@ -141,12 +141,12 @@ class Controller:
         return self._spec
 
     def close(self) -> list[str]:
-        """Stop all streams after their state was stored; returns the names of the streams that still run."""
+        """Stop all streams after storing their states; returns the names of the streams that are still running."""
         self._phase = "down"
         return sorted(name for name, actor in self._actors.items() if actor.handle is not None)
 
     def end(self) -> list[str]:
-        """End the thread and the registry; returns a line for each stream whose last state is not in the store."""
+        """End the thread and the registry; returns a line for each stream whose last state was not stored."""
         self._spec = replace(self._spec, streams={})
         if time.monotonic() - self._last_question < _GOODBYE_SECONDS:
             time.sleep(_GOODBYE_SECONDS)
@@ -157,7 +157,7 @@ class Controller:
         return [f"{name}: {trouble}" for name, trouble in sorted(self._unstored.items()) if trouble]
 
     def _change(self, change: Callable[[FleetSpec], FleetSpec], models: Models | None = None) -> list[str]:
-        """Change the desired state, once that is stored."""
+        """Store a change of the desired state, then apply it."""
         with self._changing:
             self.ready()
             spec = change(self._spec)
@@ -169,12 +169,12 @@ class Controller:
                 ended = {name for name, actor in self._actors.items() if actor.ended}
                 lines = self._spec.changes(spec, ended, are_running=self._phase == "up")
                 self._spec, self._phase = spec, "up"
-                for name in self._actors.keys() - spec.streams.keys():  # it would be taken for the next one of its name
+                for name in self._actors.keys() - spec.streams.keys():  # not for a new stream with the same name
                     self._actors[name].status, self._actors[name].ended = None, ""
             return lines
 
     def _begin(self) -> None:
-        """Open the registry, read what should run, and find what runs."""
+        """Open the registry, read the desired streams, and find the running actors."""
         import ray
 
         if self._registry is None:
@@ -185,59 +185,61 @@ class Controller:
             self._spec = from_json(stored.files["fleet"])
         if ray.get_runtime_context().was_current_actor_reconstructed:  # by Ray, while the fleet ran
             self._phase = "up"
-        self._turn()
+        self._reconcile()
         self._trouble = None
 
     def _run(self) -> None:
-        logged, due = "", time.monotonic() + _TURN_SECONDS
+        logged, deadline = "", time.monotonic() + _RECONCILE_SECONDS
         while not self._over.is_set():
             if self._registry is None or self._trouble is not None:
-                self._over.wait(_TURN_SECONDS)  # a client would take an empty answer for the end of its stream
-            elif self._registry.turn(_WAIT_SECONDS):
+                self._over.wait(_RECONCILE_SECONDS)  # an empty answer would mean the end of a client's stream
+            elif self._registry.serve(_WAIT_SECONDS):
                 self._last_question = time.monotonic()
-            if time.monotonic() < due:
+            if time.monotonic() < deadline:
                 continue
-            due = time.monotonic() + _TURN_SECONDS
+            deadline = time.monotonic() + _RECONCILE_SECONDS
             try:
                 if self._trouble is None:
-                    self._turn()
-                else:  # Ray has started it again while the store cannot be reached
+                    self._reconcile()
+                else:  # Ray has restarted the controller while the store is unreachable
                     self._begin()
-            except Exception as error:  # the next turn may succeed; the streams do not need the controller
+            except Exception as error:  # the next iteration may succeed; streams do not depend on the controller
                 if repr(error) != logged:  # once, not twice a second
-                    _log.exception("A turn of the controller failed.")
+                    _log.exception("An iteration of the controller failed.")
                 logged = repr(error)
 
-    def _turn(self) -> None:
+    def _reconcile(self) -> None:
         """Compare the actors with the desired streams, and start, stop, restart or kill them."""
         import ray
 
-        cluster, existing = nodes(), actors(self._name)  # without the lock: they ask the head
+        # Step 1: request a report from each actor.
+        cluster, existing = nodes(), actors(self._name)  # without the lock, because they query the head
         with self._lock:
             self._nodes = cluster
             if self._keys is not None:
-                self._clients = clients(self._keys)  # the next reports tell the streams
+                self._clients = clients(self._keys)  # passed to the streams with the next requests
             for name in existing.keys() | self._spec.streams.keys() | self._actors.keys():
-                self._ask(name, self._actors.setdefault(name, Actor()), existing.get(name))
+                self._request_report(name, self._actors.setdefault(name, Actor()), existing.get(name))
             calls = [actor.call for actor in self._actors.values() if actor.call is not None]
-        if calls:  # a stream that runs answers at once
+        if calls:  # a running stream answers at once
             ray.wait(calls, num_returns=len(calls), timeout=_WAIT_SECONDS)
+        # Step 2: receive the answers, and reconcile each actor.
         with self._lock:
             for name, actor in sorted(self._actors.items()):
-                is_superseded = self._hear(name, actor)
+                is_superseded = self._receive_answer(name, actor)
                 if self._phase != "idle":
-                    self._step(name, actor, is_superseded=is_superseded)
+                    self._reconcile_actor(name, actor, is_superseded=is_superseded)
             for name in self._actors.keys() - self._spec.streams.keys():
                 if self._actors[name].handle is None:
                     del self._actors[name]
 
     def _desired(self, name: str) -> StreamSpec | None:
-        """The spec of a stream; None if it should not run now."""
+        """The spec of a stream; None if it should not be running."""
         spec = self._spec.streams.get(name) if self._phase == "up" else None
         return None if spec is None or self._actors[name].ended == spec.digest else spec
 
-    def _ask(self, name: str, actor: Actor, order: str | None) -> None:
-        """Ask the actor of a stream for a report, unless it has still to answer; `order` is None if it has ended."""
+    def _request_report(self, name: str, actor: Actor, order: str | None) -> None:
+        """Request a report from an actor, unless a call is pending; `order` is None if the actor has ended."""
         import ray
 
         if order is None:
@@ -245,14 +247,14 @@ class Controller:
             actor.node, actor.stops = "", False
             return
         if actor.handle is None:  # an earlier controller has started it
-            with suppress(ValueError):  # it has died meanwhile
+            with suppress(ValueError):  # it has just died
                 actor.handle = ray.get_actor(actor_name(self._name, "stream", name, order), namespace=NAMESPACE)
                 actor.order, actor.since = order, time.monotonic()
         if actor.handle is not None and actor.call is None:
             actor.call = actor.handle.report.remote(self._clients)
 
-    def _hear(self, name: str, actor: Actor) -> bool:
-        """Take the answer of the actor of a stream, if it has arrived; returns whether it is superseded."""
+    def _receive_answer(self, name: str, actor: Actor) -> bool:
+        """Process the answer of an actor, if it has arrived; returns True if the actor is superseded."""
         import ray
         from ray.exceptions import RayError
 
@@ -261,7 +263,7 @@ class Controller:
         call, actor.call = actor.call, None
         try:
             answer = ray.get(call)
-        except RayError as error:  # its process or its node died: Ray places it again
+        except RayError as error:  # its process or its node died: Ray schedules it again
             if actor.node:
                 _log.warning("%s is interrupted: %s", name, str(error).partition("\n")[0])
                 actor.node, actor.since = "", time.monotonic()
@@ -277,8 +279,8 @@ class Controller:
             actor.ended = actor.order.partition("/")[0]
         return bool(is_superseded)
 
-    def _step(self, name: str, actor: Actor, *, is_superseded: bool) -> None:
-        """Start, stop, restart or kill the actor of a stream if it is not as it should be."""
+    def _reconcile_actor(self, name: str, actor: Actor, *, is_superseded: bool) -> None:
+        """Start, stop, restart or kill an actor if it differs from the desired stream."""
         import ray
 
         spec, now = self._desired(name), time.monotonic()
@@ -290,7 +292,7 @@ class Controller:
                 ray.kill(actor.handle)
                 actor.since = now
         elif is_superseded or spec is None or spec.order != actor.order:
-            if is_superseded or not actor.node:  # it may not store its state, or is not placed
+            if is_superseded or not actor.node:  # it must not store its state, or is not running yet
                 ray.kill(actor.handle)
             else:
                 actor.call = actor.handle.stop.remote()
@@ -302,7 +304,7 @@ class Controller:
     def _start(self, spec: StreamSpec, actor: Actor, now: float) -> None:
         import ray
 
-        with suppress(ValueError):  # the name is taken: the actor before it is not quite gone
+        with suppress(ValueError):  # the name is in use: the previous actor is still ending
             actor.handle = (
                 ray.remote(StreamActor)
                 .options(
@@ -342,28 +344,28 @@ class Controller:
             return replace(last, state="moving")
         waited = now - actor.since
         if actor.handle is not None and waited > PLACED_SECONDS:
-            return replace(last, trouble=f"Ray has not started it for {waited:.0f} s: `ray status` says what it needs")
+            return replace(last, trouble=f"Ray has not started it for {waited:.0f} s: see its demands in `ray status`")
         return last
 
     def _node_states(self) -> dict[str, NodeStatus]:
-        """The nodes by name; a dead one as long as no living node has its name."""
+        """The nodes by name; a dead node is replaced by a living one with the same name."""
         states: dict[str, NodeStatus] = {}
         for node in sorted(self._nodes, key=lambda node: (node["NodeName"], node["Alive"])):
-            here = [spec for name, spec in self._spec.streams.items() if self._actors[name].node == node["NodeID"]]
+            specs = [spec for name, spec in self._spec.streams.items() if self._actors[name].node == node["NodeID"]]
             states[node["NodeName"]] = NodeStatus(
                 node["NodeName"],
                 "alive" if node["Alive"] else "dead",
                 node["NodeManagerAddress"],
                 float(node["Resources"].get("CPU", 0.0)),
-                sum(spec.cores for spec in here),
+                sum(spec.cores for spec in specs),
                 {key: value for key, value in (node.get("Labels") or {}).items() if not key.startswith("ray.io/")},
-                len(here),
+                len(specs),
             )
         return states
 
 
 def actor_name(fleet: str, *words: str) -> str:
-    """The name of an actor: site/controller, or site/stream/cam-7/ and what it was started for."""
+    """The name of an actor: site/controller, or site/stream/cam-7/ORDER."""
     return "/".join((fleet, *words))
 
 
@@ -374,14 +376,14 @@ def named_actors() -> list[str]:
 
 
 def actors(fleet: str) -> dict[str, str]:
-    """The order with which the actor of each stream of a fleet was started, by stream."""
+    """The `StreamSpec.order` of the actor of each stream of a fleet, by stream."""
     prefix = actor_name(fleet, "stream") + "/"
     parts = (name.removeprefix(prefix).partition("/") for name in named_actors() if name.startswith(prefix))
     return {stream: order for stream, _, order in parts}
 
 
 def nodes() -> list[dict[str, Any]]:
-    """The nodes of the connected cluster as Ray describes them; one without a name is named by its address."""
+    """The nodes of the connected cluster in Ray's format; the default name is the address."""
     import ray
 
     return [node | {"NodeName": node["NodeName"] or node["NodeManagerAddress"]} for node in ray.nodes()]

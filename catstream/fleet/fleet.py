@@ -1,4 +1,4 @@
-"""The streams of a fleet, from a program: start them, change them, and see how they are.
+"""The client of a fleet: starts, changes and monitors its streams.
 
     import catstream
 
@@ -7,16 +7,16 @@
         print(fleet.status().streams["cam-7"].state)
 
 A fleet runs on a cluster of Ray that its users have started (`ray start`, KubeRay), and continues after the program.
-Without one, `up` starts one node of Ray on the loopback interface, which ends with the program. Programs that only
-watch need neither Ray nor its token: see `catstream.subscribe`.
+Without a cluster, `up` starts a Ray node on the loopback interface, which ends with the program. Programs that only
+subscribe need neither Ray nor its token: see `catstream.subscribe`.
 
 A fleet on this machine has a folder, `~/.local/state/catstream/fleets/NAME`:
 
-    lock      locked by the process whose node of Ray it is
-    address   of that node, once it has started
-    token     of Ray, so that no other user of this machine can run code there
-    store/    states of the streams, if the file of the fleet names no other store
-    logs/     of Ray and the streams, once the fleet has ended
+    lock      locked by the process that has started the Ray node
+    address   address of this node, once it has started
+    token     Ray's token, so that other users of this machine cannot run code there
+    store/    states of the streams, unless the file of the fleet has another store
+    logs/     logs of Ray and the streams, once the fleet has ended
     keys/     keys of the clients of a fleet on a cluster, on the machine of the registry
 """
 
@@ -50,15 +50,15 @@ from catstream.fleet.store import CONNECT_SECONDS, Store
 from catstream.wire.discovery import private_folder
 from catstream.wire.messages import FleetStatus
 
-ANSWER_SECONDS = 60.0  # limit for the controller to answer; Ray starts it again meanwhile, if it has died
-DOWN_SECONDS = 60.0  # limit for all streams to store their state and to end
-_LEAVE_SECONDS = 10.0  # limit for the process whose node it is to notice that the fleet has ended
-_LOOK_SECONDS = 0.2  # between two looks at any of these
-_STORE_BYTES = 80 << 20  # of Ray's object store: only saved models go through it
+ANSWER_SECONDS = 60.0  # timeout for an answer of the controller, which includes a restart by Ray
+DOWN_SECONDS = 60.0  # timeout for all streams to store their state and to end
+_LEAVE_SECONDS = 10.0  # timeout for the process that has started the node to detect the end of the fleet
+_LOOK_SECONDS = 0.2  # polling interval for these
+_STORE_BYTES = 80 << 20  # size of Ray's object store, which transfers only saved models
 
-#: Of a node that `up` starts. Ray listens on 127.0.0.1 alone only if it takes the machine for one without a cluster,
-#: and lowers the priority of its workers by default, so that streams starve beside other work. It records the tasks for
-#: `ray list`, and at the end waits seconds for a dead head to take the last of these records.
+#: Environment of a node that `up` starts. Ray listens only on 127.0.0.1 if clusters are disabled, an option for Windows
+#: and macOS. By default, it lowers the priority of its workers, so streams would starve next to other work, and records
+#: tasks for `ray list`, whose last records would delay the end by seconds if the head is dead.
 _VARIABLES = {
     "RAY_AUTH_MODE": "token",
     "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0",
@@ -74,18 +74,18 @@ class Fleet(AbstractContextManager["Fleet"]):
     Parameters
     ----------
     spec : path or FleetSpec
-        The file fleet.toml, or what was read from it. Needed for `up` only.
+        The file fleet.toml, or its content. Needed only for `up`.
     name : str
         Name of the fleet; by default the name in the spec, or the only fleet that runs.
     address : str
         HOST:PORT of the head of a cluster of Ray, of which this machine is a node; by default RAY_ADDRESS. If both are
-        empty, the fleet runs on this machine alone.
+        empty, the fleet runs only on this machine.
 
     Raises
     ------
     FleetError
-        From the constructor, if the spec is not valid, or there is no such fleet. From each method, if the controller
-        cannot be reached or does not do it; the message names the stream and the node.
+        By the constructor, if the spec is invalid or the fleet does not exist. By each method, if the controller
+        cannot be reached or rejects the call; the message names the stream and the node.
     MissingExtraError
         If Ray is not installed.
     """
@@ -101,8 +101,8 @@ class Fleet(AbstractContextManager["Fleet"]):
         if not self.name and not self._address:
             folders = sorted((state_home() / "fleets").glob("*"))
             self.name = _only([folder.name for folder in folders if _is_up(folder)], "this machine")
-        self._owned: ExitStack | None = None  # the node of Ray that `up` has started
-        self._node: dict[str, psutil.Process] = {}  # its processes: without one of them, nothing watches the streams
+        self._owned: ExitStack | None = None  # the Ray node that `up` has started
+        self._node: dict[str, psutil.Process] = {}  # its processes, all of which are needed to supervise the streams
         self._controller: Any = None
 
     @property
@@ -111,9 +111,9 @@ class Fleet(AbstractContextManager["Fleet"]):
         return self._owned is not None
 
     def up(self) -> list[str]:
-        """Make the spec the desired state; returns a line for each stream, which describes its change.
+        """Make the spec the desired state; returns a line for each stream with its change.
 
-        What runs and is unchanged is not touched. If the store cannot be used, nothing is started or changed.
+        Unchanged streams continue to run. If the store is unusable, nothing is started or changed.
         """
         if self._spec is None:
             raise FleetError("missing fleet file: the fleet has no streams yet; pass a file as in docs/how-to/fleet.md")
@@ -121,7 +121,7 @@ class Fleet(AbstractContextManager["Fleet"]):
         if not spec.store:
             if self._address:
                 raise FleetError(
-                    f'the fleet {self.name} needs a store that all nodes reach: store = "s3://BUCKET/PREFIX"'
+                    f'the fleet {self.name} needs a store that all nodes can reach: store = "s3://BUCKET/PREFIX"'
                 )
             spec = replace(spec, store=str(self._folder / "store"))
         Store(spec.store).check()
@@ -134,23 +134,23 @@ class Fleet(AbstractContextManager["Fleet"]):
             self._start_controller(spec)
             lines: list[str] = self._ask("apply", spec, models)
         except BaseException:
-            if not was_owner:  # a controller that another one has started runs on
+            if not was_owner:  # a controller that another process has started continues
                 self._end_ray()
             raise
         return lines
 
     def add(self, spec: StreamSpec) -> list[str]:
-        """Add a stream, or change the one of the same name."""
+        """Add a stream, or replace the stream of the same name."""
         lines: list[str] = self._ask("add", spec, _models([spec]))
         return [line for line in lines if line.startswith(f"{spec.name}:")]
 
     def remove(self, *names: str, forget: bool = False) -> list[str]:
-        """Remove streams. Unless `forget`, their state stays in the store: they continue if they are added again."""
+        """Remove streams. Unless `forget`, their states remain in the store: they continue if they are added again."""
         self._ask("remove", names)
         if forget:
             store = Store(self._ask("spec").store)
             for name in names:
-                store.stream(name).clear()  # its actor is superseded, if it still runs
+                store.stream(name).clear()  # supersedes its actor, if it is still running
         return [f"{name}: is removed" for name in names]
 
     def status(self) -> FleetStatus:
@@ -159,7 +159,7 @@ class Fleet(AbstractContextManager["Fleet"]):
         return answer
 
     def down(self) -> list[str]:
-        """Stop all streams after their state was stored, and the controller; of a local fleet, also Ray.
+        """Stop all streams after storing their states, then the controller and, for a local fleet, Ray.
 
         Returns a line for each stream whose last state could not be stored.
         """
@@ -167,12 +167,12 @@ class Fleet(AbstractContextManager["Fleet"]):
         while (running := self._ask("close")) and time.monotonic() < deadline:
             time.sleep(_LOOK_SECONDS)
         late = [f"{name}: it did not stop within {DOWN_SECONDS:g} s" for name in running]
-        if late and not self.is_owner:  # whose node ends with them
+        if late and not self.is_owner:  # the node of an owner ends anyway
             raise FleetError("\n".join([f"the fleet {self.name} is not down yet, run the command again", *late]))
         unstored: list[str] = late + self._ask("end")
         import ray
 
-        with suppress(ValueError):  # the controller has gone
+        with suppress(ValueError):  # the controller has ended
             ray.kill(ray.get_actor(actor_name(self.name, "controller"), namespace=NAMESPACE))
         self._end_ray()
         deadline = time.monotonic() + _LEAVE_SECONDS
@@ -182,12 +182,12 @@ class Fleet(AbstractContextManager["Fleet"]):
 
     @property
     def is_running(self) -> bool:
-        """True if its controller runs."""
+        """True if its controller is running."""
         self._connect()
         return actor_name(self.name, "controller") in named_actors()
 
     def close(self) -> None:
-        """Disconnect. A fleet continues unless this object has started Ray for it: it is stopped then."""
+        """Disconnect; stops the fleet if this object has started Ray for it."""
         if self.is_owner and self.is_running:
             self.down()
         self._end_ray()
@@ -201,7 +201,7 @@ class Fleet(AbstractContextManager["Fleet"]):
         return state_home() / "fleets" / self.name
 
     def _start_ray(self) -> None:
-        """Start a node of Ray on the loopback interface, unless another process has done so."""
+        """Start a Ray node on the loopback interface, unless another process has started it."""
         self._folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         with ExitStack() as stack:
             file = stack.enter_context((self._folder / "lock").open("w"))
@@ -226,11 +226,11 @@ class Fleet(AbstractContextManager["Fleet"]):
             self._owned = stack.pop_all()
 
     def _check_node(self) -> None:
-        """End the node of Ray that `up` has started, and raise FleetError, if one of its processes has died."""
+        """End the Ray node that `up` has started, and raise FleetError, if one of its processes has died."""
         for name, process in self._node.items():
             with suppress(psutil.TimeoutExpired):
                 status = process.wait(0)
-                for each in self._node.values():  # a raylet without its head would run on for a minute
+                for each in self._node.values():  # a raylet without its head would continue for a minute
                     _kill(each)
                 self._end_ray()
                 raise FleetError(
@@ -239,7 +239,7 @@ class Fleet(AbstractContextManager["Fleet"]):
                 )
 
     def _keep_logs(self, files: Path) -> None:
-        """Move the logs of Ray and the streams out of the temporary folder of a node."""
+        """Move the logs of Ray and the streams from the temporary folder of a node to the fleet's folder."""
         shutil.rmtree(self._folder / "logs", ignore_errors=True)
         with suppress(OSError):
             shutil.move(files / "session_latest" / "logs", self._folder / "logs")
@@ -273,9 +273,9 @@ class Fleet(AbstractContextManager["Fleet"]):
         """Connect to a cluster, or start a node."""
         if not self._address:
             os.environ.update(_VARIABLES | {"RAY_AUTH_TOKEN_PATH": str(self._folder / "token")})
-        os.environ.setdefault("RAY_NUM_REDIS_GET_RETRIES", "2")  # of 41 s each if the head dies now, by default 20
+        os.environ.setdefault("RAY_NUM_REDIS_GET_RETRIES", "2")  # 41 s each if the head dies; the default is 20
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of Ray, about its own future
+            warnings.simplefilter("ignore")  # FutureWarnings of Ray
             import ray
 
             if ray.is_initialized():
@@ -287,17 +287,17 @@ class Fleet(AbstractContextManager["Fleet"]):
                 ray.init(
                     address or "local", namespace=NAMESPACE, log_to_driver=False, logging_level=logging.ERROR, **options
                 )
-            except Exception as error:  # Ray has no type for a node that does not start
+            except Exception as error:  # Ray has no exception class for a failed start
                 why = str(error).strip().partition("\n")[0]
                 if address is None:
                     raise FleetError(f"Ray does not start on this machine: {why}") from None
                 raise FleetError(
-                    f"cannot connect to the cluster of Ray at {address}: {why}\nThis machine has to be a node of it "
+                    f"cannot connect to the cluster of Ray at {address}: {why}\nThis machine must be a node of it "
                     "(`ray start --address ...`), with the same versions of Python and Ray, and its token "
                     "(RAY_AUTH_MODE=token, RAY_AUTH_TOKEN_PATH)"
                 ) from None
             if callable(handler) and threading.current_thread() is threading.main_thread():
-                signal.signal(signal.SIGTERM, handler)  # Ray aborts the process in its place
+                signal.signal(signal.SIGTERM, handler)  # Ray's handler would abort the process
 
     def _end_ray(self) -> None:
         """Disconnect, and end the node that this object has started."""
@@ -308,7 +308,7 @@ class Fleet(AbstractContextManager["Fleet"]):
             _disconnect()
 
     def _start_controller(self, spec: FleetSpec) -> None:
-        """Start the controller, if it does not run, on the node whose address the registry has."""
+        """Start the controller, if it is not running, on the node of the registry's address."""
         import ray
 
         options: dict[str, Any] = {}
@@ -317,7 +317,7 @@ class Fleet(AbstractContextManager["Fleet"]):
             listen, keys = f"tcp://{registry}", str(self._folder / "keys")
             options["resources"] = {f"node:{registry.rpartition(':')[0]}": 0.001}
         else:
-            listen, keys = str(self._folder / "registry"), ""  # it stays if Ray starts the controller again
+            listen, keys = str(self._folder / "registry"), ""  # the same if Ray restarts the controller
         self._controller = (
             ray.remote(Controller)
             .options(
@@ -368,14 +368,14 @@ class Fleet(AbstractContextManager["Fleet"]):
 
 
 def _gcs_address() -> str:
-    """HOST:PORT of the head of the cluster that this process uses."""
+    """HOST:PORT of the head of this process's cluster."""
     import ray
 
     return str(ray.get_runtime_context().gcs_address)
 
 
 def _kill(process: psutil.Process) -> None:
-    """Kill a process and all that it has started."""
+    """Kill a process and its descendants."""
     with suppress(psutil.NoSuchProcess):
         for each in (process, *process.children(recursive=True)):
             with suppress(psutil.NoSuchProcess):
@@ -389,7 +389,7 @@ def _disconnect() -> None:
 
 
 def _is_up(folder: Path) -> bool:
-    """Return True if a process has, or starts, the node of Ray of a fleet on this machine."""
+    """Return True if a process runs or starts the Ray node of a fleet on this machine."""
     with suppress(OSError), (folder / "lock").open() as file:
         return is_locked(file.fileno())
     return False
@@ -397,16 +397,16 @@ def _is_up(folder: Path) -> bool:
 
 def _only(fleets: Sequence[str], where: str) -> str:
     if len(fleets) != 1:
-        help_ = f"say which (--name), there are {', '.join(fleets)}" if fleets else "start one with catstream fleet up"
+        help_ = f"select one of {', '.join(fleets)} (--name)" if fleets else "start one with catstream fleet up"
         raise FleetError(f"{len(fleets)} fleets run on {where}: {help_}")
     return fleets[0]
 
 
 def _models(streams: Iterable[StreamSpec]) -> dict[tuple[str, str], bytes]:
-    """The contents of the saved models that specs name, by stream and object."""
+    """The contents of the saved models of streams, by stream and object."""
     contents = {}
     for stream in streams:
         for name, file in stream.models.items():
-            SavedModel.load(file)  # its errors name the file
+            SavedModel.load(file)  # validates it; errors name the file
             contents[stream.name, name] = file.read_bytes()
     return contents

@@ -1,4 +1,4 @@
-"""The server of the registry of a fleet: answers where each stream runs, see `catstream.client.registry`."""
+"""The server of the registry of a fleet, which locates streams: see `catstream.client.registry`."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from catstream.wire.messages import FleetStatus, Listing, Question
 class RegistryServer:
     """Answers the questions of clients about the streams and nodes of a fleet.
 
-    It listens at tcp://HOST:PORT with the keys of a folder, or in a folder of Unix sockets; if that is empty, in a new
-    one. Other processes of this user find it by the fleet's name.
+    It listens at tcp://HOST:PORT with the keys of a folder, or in a folder of Unix sockets, by default a new one. Other
+    processes of this user find it by the fleet's name.
     """
 
     def __init__(self, listen: str, keys: str, status: Callable[[], FleetStatus]) -> None:
@@ -29,8 +29,8 @@ class RegistryServer:
             self._responder = stack.enter_context(Responder[Question, Listing](REGISTRY, self.endpoint))
             self.close = stack.pop_all().close
 
-    def turn(self, seconds: float = 0.0) -> int:
-        """Answer all questions that have arrived within some seconds, and return their number."""
+    def serve(self, seconds: float = 0.0) -> int:
+        """Answer all questions, waiting up to `seconds` for the first; returns their number."""
         questions = self._responder.receive_all(seconds)
         status = self._status() if questions else None
         for question in questions:

@@ -1,7 +1,7 @@
-"""The desired state of a fleet: its streams, as a file in TOML describes them.
+"""The desired state of a fleet: its streams, from a TOML file.
 
-docs/how-to/fleet.md shows such a file. Relative paths count from its folder. Every error is a `FleetError` that names
-the stream, or the line of a file that is not TOML.
+docs/how-to/fleet.md shows an example. Paths are relative to the folder of the file. Every error is a `FleetError` with
+the stream, or with the line of invalid TOML.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from catstream.processes.job import Job, changed_setting
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,63}")
 _HOST_AND_PORT = Annotated[str, Meta(pattern=r"^([A-Za-z0-9_.-]+:[0-9]{1,5})?$")]
 
-#: The type of each key of a fleet, and what its value must be.
+#: Type and description of valid values of each key of a fleet.
 _FLEET: dict[str, tuple[Any, str]] = {
     "name": (str, "a text"),
     "store": (str, "a text"),
@@ -43,10 +43,10 @@ _FLEET: dict[str, tuple[Any, str]] = {
     "streams": (dict[str, Any], "tables [streams.NAME]"),
 }
 
-#: Those that count from the start of the fleet.
+#: Keys that are read only at the start of the fleet.
 _AT_START = ("name", "store", "every", "registry")
 
-#: The same of a stream.
+#: Type and description of valid values of each key of a stream.
 _STREAM: dict[str, tuple[Any, str]] = {
     "source": (str, "a text"),
     "box": (Any, ""),
@@ -61,19 +61,17 @@ _STREAM: dict[str, tuple[Any, str]] = {
 
 @dataclass(frozen=True)
 class StreamSpec:
-    """A stream that a fleet should run.
+    """A stream that a fleet should run; FleetError if a value is invalid.
 
     name      unique in the fleet: 1 to 64 letters, digits, '_', '-' and '.', not '-' or '.' first
-    source    the text that `catstream track` takes
-    boxes     the objects in the first frame, by name
-    models    file of each object that is searched for, by name
+    source    source, as for `catstream track`
+    boxes     initial boxes of the objects, by name
+    models    saved model of each searched object, by name
     settings  values of settings by full name; the fleet sets run.endpoint and run.keys
-    cores     cores that Ray reserves for it
-    labels    labels that its node must have
+    cores     cores that Ray reserves
+    labels    required labels of its node
     write     destinations of its tracks
-    options   of these destinations
-
-    It raises FleetError if a value is not valid.
+    options   options of these destinations
     """
 
     name: str
@@ -103,7 +101,7 @@ class StreamSpec:
     def parse(
         cls, name: str, table: Mapping[str, object], folder: Path, defaults: Mapping[str, Any] | None = None
     ) -> StreamSpec:
-        """Make a stream from the table of a file in `folder`; values that it lacks are the defaults."""
+        """Parse the table of a stream in a file in `folder`; missing values are from `defaults`."""
         check_fleet_name(name, "stream")
         with errors_in(f"the stream {name}", FleetError):
             if not isinstance(table, Mapping):
@@ -116,7 +114,7 @@ class StreamSpec:
                 values.setdefault(several, {UNNAMED: values.pop(one)} if one in values else {})
             source = values["source"]
             if source.strip() and not is_live(source) and "://" not in source:
-                values["source"] = str(folder / source)  # its node has another working folder
+                values["source"] = str(folder / source)  # the working folder on its node is different
             values["boxes"] = boxes_by_name(values["boxes"])
             values["models"] = {object: folder / file for object, file in by_name(values["models"]).items()}
             values["settings"] = flat(values.get("settings", {}))
@@ -126,10 +124,10 @@ class StreamSpec:
 
     @cached_property  # the controller reads it twice a second
     def digest(self) -> str:
-        """Text that changes exactly with the source, objects, settings or destinations: what the stream does.
+        """Hash of the source, objects, settings and destinations.
 
-        Settings count by their values, so that writing down a default changes nothing. Of a model, its path counts and
-        not its content.
+        Settings are compared by value, so an explicit default does not change the hash. Models are compared by path,
+        not by content.
         """
         models = {name: str(file) for name, file in self.models.items()}
         boxes = {name: list(map(float, box)) for name, box in self.boxes.items()}
@@ -140,7 +138,7 @@ class StreamSpec:
 
     @cached_property
     def order(self) -> str:
-        """The digest, and where it runs: the actor of the stream has to start again if it changes."""
+        """The digest and a hash of the placement: if it changes, the actor of the stream is restarted."""
         return f"{self.digest}/{_hash([self.cores, self.labels])}"
 
 
@@ -149,10 +147,10 @@ class FleetSpec:
     """The desired state of a fleet.
 
     name     name of the fleet, with the rules of a stream's name
-    store    folder or URL of the states; "" for a folder that belongs to the fleet
-    every    seconds between two states of a stream in the store; 0: as often as 9 GB a day allow
-    registry HOST:PORT where clients ask for the streams; "" for the head of the cluster, and the default port
-    streams  the streams by name
+    store    folder or URL of the states; "" for a folder of the fleet
+    every    interval in seconds between two states of a stream in the store; 0 for a limit of 9 GB a day
+    registry HOST:PORT of the registry; "" for the head of the cluster, and the default port
+    streams  streams by name
     """
 
     name: str
@@ -165,15 +163,16 @@ class FleetSpec:
         check_fleet_name(self.name, "fleet")
         with errors_in(f"the fleet {self.name}", FleetError):
             _checked({key: getattr(self, key) for key in _AT_START}, _FLEET)
-            owners: dict[str, str] = {}
+            writers: dict[str, str] = {}
             for name, dest in ((name, dest) for name, stream in self.streams.items() for dest in stream.write):
-                if (owner := owners.setdefault(dest, name)) != name and not dest.startswith("http"):  # a webhook
+                first = writers.setdefault(dest, name)
+                if first != name and not dest.startswith("http"):  # streams may share a webhook
                     where = redacted(dest)
-                    raise FleetError(f"the streams {owner} and {name} write to {where}: put {{stream}} into write")
+                    raise FleetError(f"the streams {first} and {name} write to {where}: put {{stream}} into write")
 
     @classmethod
     def load(cls, path: Path) -> FleetSpec:
-        """Read the file of a fleet; FleetError if it has no streams, or has a key or value that is not valid."""
+        """Read the file of a fleet; FleetError if it has no streams, or an invalid key or value."""
         tables = read_toml(path, FleetError)
         with errors_in(str(path), FleetError):
             values, folder = {"name": path.stem} | _checked(tables, _FLEET), path.parent.absolute()
@@ -190,7 +189,7 @@ class FleetSpec:
             return cls(**values, streams=streams)
 
     def check_follows(self, earlier: FleetSpec) -> None:
-        """Raise FleetError if this cannot take the place of an earlier spec of the fleet: its states stay in use."""
+        """Raise FleetError if this spec cannot replace an earlier one of the fleet, whose states remain in use."""
         if self.store != earlier.store:
             raise FleetError(
                 f"the store of fleet {self.name} cannot change while it runs (now {earlier.store!r}, file "
@@ -205,7 +204,7 @@ class FleetSpec:
                 )
 
     def without(self, names: Collection[str]) -> dict[str, StreamSpec]:
-        """The other streams; FleetError if there is no stream of one of the names."""
+        """The streams without those of these names; FleetError if a name is unknown."""
         for name in names:
             if name not in self.streams:
                 streams = ", ".join(self.streams) or "none"
@@ -213,7 +212,7 @@ class FleetSpec:
         return {name: stream for name, stream in self.streams.items() if name not in names}
 
     def changes(self, new: FleetSpec, ended: Collection[str], *, are_running: bool) -> list[str]:
-        """Describe the changes if another spec takes the place of this one, a line for each stream and key."""
+        """Describe the changes if a new spec replaces this one, a line for each stream and key."""
         same = "is unchanged" if are_running else "continues from its last state"
         lines = []
         for name in sorted(self.streams.keys() | new.streams.keys()):
@@ -233,12 +232,12 @@ def _hash(parts: object) -> str:
 
 
 def to_json(spec: FleetSpec) -> bytes:
-    """A spec as JSON. It contains the sources with their passwords."""
+    """Encode a spec as JSON. It contains the sources with their passwords."""
     return msgspec.json.encode(spec, enc_hook=str)
 
 
 def from_json(data: bytes) -> FleetSpec:
-    """Read what `to_json` wrote; raise FleetError if it is damaged."""
+    """Decode a spec; FleetError if it is damaged."""
     try:
         return msgspec.json.decode(data, type=FleetSpec, dec_hook=lambda part, value: part(value))
     except (msgspec.DecodeError, RecursionError, CatstreamError):
@@ -246,13 +245,13 @@ def from_json(data: bytes) -> FleetSpec:
 
 
 def _checked(values: Mapping[str, object], kinds: Mapping[str, tuple[Any, str]]) -> dict[str, Any]:
-    """The values of keys; FleetError if there is no such key, or its value has another type."""
+    """Convert the values of keys; FleetError if a key is unknown, or the type of a value is invalid."""
     checked = {}
     for key, value in values.items():
         if key not in kinds:
             near = difflib.get_close_matches(key, kinds, n=1)
             meant = f", did you mean {near[0]!r}?" if near else ":"
-            raise FleetError(f"there is no key {key!r}{meant} there are {', '.join(kinds)}")
+            raise FleetError(f"unknown key {key!r}{meant} expected {', '.join(kinds)}")
         kind, meaning = kinds[key]
         try:
             checked[key] = msgspec.convert(value, kind)
@@ -264,7 +263,7 @@ def _checked(values: Mapping[str, object], kinds: Mapping[str, tuple[Any, str]])
 
 
 def check_fleet_name(name: object, kind: str) -> None:
-    """Raise FleetError if something may not be the name of a fleet or of a stream."""
+    """Raise FleetError if a name of a fleet or of a stream is invalid."""
     if not isinstance(name, str) or not _NAME.fullmatch(name):
         raise FleetError(
             f"{reprlib.repr(name)} is not a valid name of a {kind}: expected 1 to 64 letters, digits, '_', '-' and "

@@ -4,26 +4,26 @@
     models/NAME/OBJECT/    saved model with which an object of a stream begins
     fleet/                 desired streams of the fleet
 
-Below each of these folders, only the newest holder decides what comes next:
+In each of these folders, only the holder of the newest claim decides the next state:
 
     <token>/claim     the claim of a holder; its token is higher than every earlier token
     <token>/<n>       its states: n = 1, 2, 3 ...
 
-    claim   create the claim of the highest token + 1; this fails if another process has it already: try the next one
-    write   create the next state under the own token, then list the folder: if there is a claim with a higher token,
-            this holder was superseded, and has to stop
-    read    take the newest undamaged state of the highest token that has one
+    claim   create the claim of the highest token + 1. If another process has created it already, try the next token
+    write   create the next state under the own token, then list the folder. If there is a claim with a higher token,
+            this holder was superseded, and must stop
+    read    read the newest undamaged state of the highest token with a state
 
-A holder that was paused or disconnected may continue to write under its own token: as soon as the newer holder has
-written a state, older ones are not read. Before that, they continue the state that the newer holder began from. If the
-answer to a claim or a write is lost, the caller uses the next token or number; a half-written state is passed over.
+A holder that was paused or disconnected may continue to write under its own token. Once the newer holder has written a
+state, older ones are ignored. Before, they continue the state from which the newer holder began. If the answer to a
+claim or a write is lost, the caller uses the next token or number; incomplete states are skipped.
 
-A holder removes all states but the newest two, and the older claims without a state. A removed stream keeps one state,
+A holder removes all states except the newest two, and older claims without a state. A removed stream keeps one state,
 which hides late writes of an earlier holder (docs/decisions.md, 78).
 
-A state contains the source of its stream, which may contain a password: only its owner may enter the folders, and a
-bucket has to be private. obstore takes the credentials of S3 from the environment or the machine's role, and the
-address of another server from AWS_ENDPOINT_URL. They are not part of the URL, which is shown in messages.
+A state contains the source of its stream, which may contain a password. Therefore the folders and the bucket must be
+private. obstore reads the credentials of S3 from the environment or the machine's role, and the address of another
+server from AWS_ENDPOINT_URL. They are not part of the URL, which is shown in messages.
 """
 
 from __future__ import annotations
@@ -47,28 +47,28 @@ from catstream.errors import FencedError, FleetError, ProtocolError, StoreError,
 from catstream.fleet.spec import check_fleet_name
 from catstream.wire import storage
 
-STORE_SECONDS = 10.0  # limit of a request to a server
-CONNECT_SECONDS = 3.0  # limit to connect to a server
+STORE_SECONDS = 10.0  # timeout of a request to a server
+CONNECT_SECONDS = 3.0  # timeout for a connection to a server
 
 _FOLDERS = ("streams", "models", "fleet")
 _CLAIM = "claim"
-_DIGITS = 8  # of a token and of the number of a state in their names
-_KEEP = 2  # newest states
-_ATTEMPTS = 20  # to claim, or to read the newest state, while other processes change the folder
-_NO_NAME = "-"  # folder of the object without a name: no name begins with a dash
+_DIGITS = 8  # of a token and of a state's number in names
+_KEEP = 2  # number of newest states that are not removed
+_ATTEMPTS = 20  # to claim or read while other processes change the folder
+_NO_NAME = "-"  # folder of the object without a name; names do not begin with a dash
 _PROBE = "created-exclusively"
 _BUCKET = re.compile(r"[a-z0-9][a-z0-9.-]{1,61}[a-z0-9]")
-_CODE = re.compile(r"<Code>(\w{1,64})</Code>")  # in an answer of S3
+_CODE = re.compile(r"<Code>(\w{1,64})</Code>")  # in a response of S3
 _NUMBER = re.compile(r"\(os error ([0-9]+)\)")  # in an error of obstore
-_ROLE = "/latest/"  # in the address at which a machine asks for the credentials of its role
+_ROLE = "/latest/"  # in the address of the metadata service, which provides the credentials of a role
 
 
 class Store:
-    """The store of a fleet: objects below a folder or a prefix of a bucket, created exclusively and never changed.
+    """The store of a fleet: immutable objects below a folder or a prefix of a bucket, created exclusively.
 
-    The URL is a folder or s3://bucket/prefix; FleetError if it is not valid, or contains credentials.
-    Every method raises StoreError if the store cannot be reached or is full; a call that creates an object may
-    nevertheless have created it. No message contains a credential.
+    The URL is a folder or s3://bucket/prefix; FleetError if it is invalid or contains credentials.
+    Every method raises StoreError if the store cannot be reached or is full; an object may have been created
+    nevertheless. Messages contain no credentials.
     """
 
     def __init__(self, url: str) -> None:
@@ -89,9 +89,9 @@ class Store:
         return StateStore(self, f"models/{stream}/{_NO_NAME if name == UNNAMED else check_name(name)}")
 
     def check(self) -> None:
-        """Create the folders of the store; StoreError if it cannot be used.
+        """Create the folders of the store; StoreError if it is unusable.
 
-        A bucket has to exist, on a server that creates exclusively.
+        A bucket must exist, on a server that supports exclusive creation.
         """
         if self._folder is not None:
             with self._errors("", "created"):
@@ -104,41 +104,41 @@ class Store:
         except FileExistsError:
             return
         raise StoreError(
-            f"the store {self._url} is on a server that ignores If-None-Match, so that two processes could write the "
-            "state of one stream: use a server that supports it, such as AWS S3 or a current MinIO"
+            f"the server of the store {self._url} ignores If-None-Match, so two processes could write the state of one "
+            "stream: use a server that supports it, such as AWS S3 or a current MinIO"
         )
 
     def create(self, name: str, data: bytes) -> None:
-        """Create an object; FileExistsError if there is one of this name."""
+        """Create an object; FileExistsError if it exists already."""
         from obstore.exceptions import AlreadyExistsError
 
         with self._errors(name, "written"):
             try:
                 self._store.put(name, data, mode="create")
-            except AlreadyExistsError:  # also: another process creates it at this moment
+            except AlreadyExistsError:  # or another process is creating it
                 raise FileExistsError(name) from None
 
     def read(self, name: str) -> bytes:
-        """Return the content of an object; FileNotFoundError if there is none."""
+        """Return the content of an object; FileNotFoundError if it does not exist."""
         with self._errors(name, "read"):
             return bytes(self._store.get(name).bytes())
 
     def names(self, folder: str) -> list[str]:
-        """Return the names of all objects below a folder, without the name of the folder."""
+        """Return the names of all objects below a folder, relative to it."""
         with self._errors(folder, "listed"):
             return [entry["path"][len(folder) + 1 :] for entry in self._store.list(folder).collect()]
 
     def remove(self, name: str) -> None:
-        """Remove an object, if it exists, and beside it in a folder the parts that killed processes left."""
+        """Remove an object, if it exists, and incomplete files of killed processes next to it."""
         with contextlib.suppress(FileNotFoundError), self._errors(name, "removed"):
             if self._folder is not None:
-                for part in (self._folder / name).parent.glob("*#*"):  # as obstore names what it writes
+                for part in (self._folder / name).parent.glob("*#*"):  # obstore's names of incomplete files
                     part.unlink()
             self._store.delete(name)
 
     @cached_property
     def _store(self) -> Any:
-        """The folder, or the bucket, to which requests are sent once: the caller writes a newer state later."""
+        """The client of the folder or bucket. Requests are not retried: the caller writes a newer state later."""
         from obstore.store import LocalStore, from_url
 
         if self._folder is not None:
@@ -149,14 +149,14 @@ class Store:
         limits |= {"connect_timeout": timedelta(seconds=CONNECT_SECONDS)}
         return from_url(
             self._url,
-            client_options=limits | {"allow_http": True},  # at an address that begins with http
+            client_options=limits | {"allow_http": True},  # for addresses that begin with http
             retry_config={"max_retries": 0},
-            disable_bulk_delete=True,  # one object each time, and not all servers have it
+            disable_bulk_delete=True,  # not supported by all servers
         )
 
     @contextlib.contextmanager
     def _errors(self, name: str, what: str) -> Iterator[None]:
-        """In the block, every error becomes a StoreError, except that an object exists, or does not exist."""
+        """Convert every error in the block to a StoreError, except that an object exists or does not exist."""
         try:
             yield
         except StoreError:
@@ -170,7 +170,7 @@ class Store:
 
 
 def _parse(url: str) -> tuple[str, Path | None]:
-    """A URL as it is shown, and its folder. No error shows the URL: it may contain a password."""
+    """The URL for messages, and its folder. Errors do not contain the URL, which may contain a password."""
     parts = urlsplit(url)
     if "://" not in url:
         return str(Path(url).resolve()), Path(url).resolve()
@@ -185,7 +185,7 @@ def _parse(url: str) -> tuple[str, Path | None]:
 
 
 def _trouble(error: Exception) -> str:
-    """Describe an error and its remedy without the text of the error, which may contain a credential."""
+    """Describe an error and its remedy, without the original text, which may contain credentials."""
     text = str(error)
     if code := _CODE.search(text):
         return f"the server answered {code[1]}: check the bucket, its region (AWS_REGION) and its permissions"
@@ -201,10 +201,10 @@ def _trouble(error: Exception) -> str:
 
 
 class Contents(NamedTuple):
-    """The names below the folder of a stream.
+    """The listing of the folder of a stream.
 
     claims  tokens of the claims
-    states  of each state, the token of its writer and its number
+    states  token of the writer and number of each state
     """
 
     claims: set[int]
@@ -212,7 +212,7 @@ class Contents(NamedTuple):
 
     @classmethod
     def of(cls, names: Iterable[str]) -> Contents:
-        """The listing of these names, each without the folder; other names are passed over.
+        """Parse names relative to the folder; unknown names are ignored.
 
         >>> Contents.of(["00000001/claim", "00000001/00000007", "00000001/.part"])
         Contents(claims={1}, states={(1, 7)})
@@ -227,9 +227,9 @@ class Contents(NamedTuple):
 class Snapshot:
     """A state of a stream in the store.
 
-    token   of the holder that wrote it
+    token   token of the holder that wrote it
     files   contents by name
-    facts   JSON: frame, time and other facts of the writer
+    facts   JSON: frame, time and other facts by the writer
     """
 
     token: int
@@ -238,46 +238,46 @@ class Snapshot:
 
 
 class StateStore:
-    """The states below a folder of the store. Every method raises StoreError if the store fails; it may be repeated."""
+    """The states in a folder of the store. Every method may be repeated, and raises StoreError if the store fails."""
 
     def __init__(self, objects: Store, folder: str) -> None:
         self._objects = objects
         self.folder = folder
 
     def newest(self) -> Snapshot | None:
-        """Return the newest undamaged state of the highest token that has one."""
+        """Return the newest undamaged state of the highest token with a state, or None."""
         for _ in range(_ATTEMPTS):
-            with contextlib.suppress(FileNotFoundError):  # removed by the holder since the folder was listed
+            with contextlib.suppress(FileNotFoundError):  # the holder has removed it after the listing
                 state = next(filter(None, map(self._read, sorted(self.listed().states, reverse=True))), None)
                 return None if state is None or state.facts.get("removed") else state
         raise self._busy("read")
 
     def claim(self) -> Claim:
-        """Become the only process that may write states."""
+        """Claim the exclusive right to write states."""
         for _ in range(_ATTEMPTS):
             listing = self.listed()
             token = max([0, *listing.claims, *(token for token, _ in listing.states)]) + 1
-            with contextlib.suppress(FileExistsError):  # another process claims at this moment
+            with contextlib.suppress(FileExistsError):  # another process has just claimed this token
                 self._objects.create(self._name(token, _CLAIM), b"")
                 return Claim(self, token, self.newest())
         raise self._busy("claimed")
 
     def put(self, files: Mapping[str, bytes], facts: Mapping[str, Any]) -> None:
-        """Write a state where there is no lasting holder. Of two processes at once, both write, one after the other."""
+        """Claim, and write a single state. Concurrent calls write one after the other."""
         for _ in range(_ATTEMPTS):
             with contextlib.suppress(FencedError):
                 return self.claim().write(files, facts)
         raise self._busy("written")
 
     def clear(self) -> None:
-        """Remove all states. A process that still holds them is superseded: it can no longer write."""
+        """Remove all states, and supersede the holder, which can no longer write."""
         if self.newest() is not None:
             claim = self.claim()
             claim.write({}, {"removed": True})
             self.remove_up_to(claim.token, self.listed(), keep=1)
 
     def listed(self) -> Contents:
-        """The names below the folder now."""
+        """List the folder."""
         return Contents.of(self._objects.names(self.folder))
 
     def create(self, token: int, number: int, files: Mapping[str, bytes], facts: Mapping[str, Any]) -> None:
@@ -285,12 +285,12 @@ class StateStore:
         self._objects.create(self._name(token, number), storage.encode(arrays, {"facts": dict(facts)}))
 
     def remove_up_to(self, token: int, listing: Contents, keep: int) -> None:
-        """Remove the states up to a token but the newest ones, and the claims below it that have none any more."""
-        before = sorted(version for version in listing.states if version[0] <= token)
-        stay = before[len(before) - keep :]
-        for version in before[: len(before) - keep]:
+        """Remove the states up to a token except the newest `keep`, and lower claims without a remaining state."""
+        states = sorted(version for version in listing.states if version[0] <= token)
+        remaining = states[len(states) - keep :]
+        for version in states[: len(states) - keep]:
             self._objects.remove(self._name(*version))
-        for old in sorted(listing.claims - {writer for writer, _ in stay}):
+        for old in sorted(listing.claims - {writer for writer, _ in remaining}):
             if old < token:
                 self._objects.remove(self._name(old, _CLAIM))
 
@@ -298,7 +298,7 @@ class StateStore:
         return f"{self.folder}/{token:0{_DIGITS}}/{rest if isinstance(rest, str) else f'{rest:0{_DIGITS}}'}"
 
     def _read(self, version: tuple[int, int]) -> Snapshot | None:
-        """A state; None if it is damaged."""
+        """Read a state; None if it is damaged."""
         name = self._name(*version)
         try:
             arrays, header = storage.decode(self._objects.read(name), name)
@@ -312,10 +312,10 @@ class StateStore:
 
 
 class Claim:
-    """The right to write the states of a stream, until another process claims it.
+    """The exclusive right to write the states of a stream, until another process claims it.
 
-    token    higher than every earlier token
-    state    the state to continue from; None if there is none
+    token    fencing token, higher than all earlier tokens
+    state    state from which to continue, or None
     """
 
     def __init__(self, states: StateStore, token: int, state: Snapshot | None) -> None:
@@ -326,20 +326,20 @@ class Claim:
     def write(self, files: Mapping[str, bytes], facts: Mapping[str, Any]) -> None:
         """Write a state, and remove older ones.
 
-        Raises FencedError if another process has claimed the stream, and again in every later call; StoreError if the
-        store fails: the caller continues, and writes a newer state later.
+        Raises FencedError, now and in all later calls, if another process has claimed the stream. Raises StoreError if
+        the store fails; the caller may continue, and write a newer state later.
         """
         if self._fenced is not None:
             raise self._fenced
-        self._number += 1  # its number is not used again, also if this fails
-        with contextlib.suppress(FileExistsError):  # the answer was lost, and the request sent again
+        self._number += 1  # not reused, even if this fails
+        with contextlib.suppress(FileExistsError):  # the answer was lost, and the request was repeated
             self._states.create(self.token, self._number, files, facts)
         listing = self.check()
-        with contextlib.suppress(StoreError):  # they are removed after the next write
+        with contextlib.suppress(StoreError):  # the next write retries
             self._states.remove_up_to(self.token, listing, _KEEP)
 
     def check(self) -> Contents:
-        """Raise FencedError if there is a claim with a higher token, or this one was removed."""
+        """Return the listing of the folder; FencedError if there is a higher token, or this claim was removed."""
         listing = self._states.listed()
         if self.token in listing.claims and max(listing.claims) == self.token:
             return listing
