@@ -203,7 +203,7 @@ def _print_run(result: Result, limits: list[Limit]) -> None:
         f"{milliseconds(result.camera_late)} ms late"
     )
     for part in tables(result):
-        output = table(*part.heads, right=part.heads[1:])
+        output = table(*part.headers, right=part.headers[1:])
         for row in part.cells:
             output.add_row(*row)
         screen().print(output)

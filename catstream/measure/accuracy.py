@@ -23,11 +23,11 @@ HEADINGS = ("AUC", "success", "precision", "norm. precision", "absence noticed",
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """The measures of a sequence, or of several: means of the measures, and sums of the numbers of frames.
+    """The measures of a sequence; or over several sequences, means of measures and sums of numbers of frames.
 
-    name   of the sequence, or "mean"
-    score  the measures: see `scores.Score`
-    fps    frames per second of the tracker alone
+    name   name of the sequence, or "mean"
+    score  measures, see `scores.Score`
+    fps    frames per second of the tracker without decoding
     """
 
     name: str
@@ -70,7 +70,7 @@ def to_json(rows: Sequence[Row], settings: Settings) -> dict[str, object]:
 
 
 def write_report(path: Path, runs: Sequence[Run], settings: Settings, errors: Sequence[CatstreamError] = ()) -> Path:
-    """Write the report of an evaluation as one self-contained HTML file; `errors` are those of the missing runs."""
+    """Write the report of an evaluation as a self-contained HTML file; `errors` are of the failed runs."""
     rows = [Row.of(run) for run in runs]
     return write_page(
         path,
@@ -86,7 +86,7 @@ def write_report(path: Path, runs: Sequence[Run], settings: Settings, errors: Se
 
 
 def _plots(runs: Sequence[Run]) -> Iterator[dict[str, object]]:
-    """Yield the success plot and the precision plot, means over the sequences, with the points of their curves."""
+    """Yield the success plot and the precision plot, averaged over the sequences, with the points of their curves."""
     for title, label, thresholds, measure in (
         ("Success", "overlap threshold", OVERLAPS, success_plot),
         ("Precision", "distance in pixels", PIXELS, precision_plot),

@@ -1,8 +1,8 @@
-"""The camera of a load test: a process that sends a known video over HTTP or RTSP at the times of a schedule.
+"""The camera of a load test: a process that sends a known video over HTTP or RTSP by a schedule.
 
-Each frame is sent when it is due, even if the receiver has not read the frames before it; a slow receiver gets frames
-late, but none is dropped. The time stamp of a frame in the stream is its due time by `time.monotonic`, so the receiver
-can compute its number and its age.
+Each frame is sent when it is due, even if the receiver has not read earlier frames: a slow receiver gets frames late,
+but no frame is dropped. The time stamp of a frame in the stream is its due time by `time.monotonic`, from which the
+receiver computes its number and its age.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ from catstream.errors import ServiceError
 from catstream.measure.mjpeg import MjpegConnection
 from catstream.measure.rtsp import RtspConnection
 
-_STILL_RATE = 25.0  # frames per second of the still image before a schedule is played
+_STILL_RATE = 25.0  # frames per second of the still image before a schedule begins
 
 
 @dataclass(frozen=True, slots=True)
 class Schedule:
-    """The due time of each frame. Before the first one, a still image is sent.
+    """The due time of each frame. Before the first frame, a still image is sent.
 
     start  due time of frame 0, by `time.monotonic`
     rate   frames per second
@@ -49,20 +49,20 @@ class Schedule:
         return self.start + number / self.rate
 
     def due_times(self, frames: int) -> Float64:
-        """Return the due times of so many frames, float64 (frames,)."""
+        """Return the due times of the first frames, float64 (frames,)."""
         return self.start + np.arange(frames) / self.rate
 
     def number(self, moment: float) -> int:
-        """Return the frame whose due time is nearest to a moment."""
+        """Return the frame with the due time nearest to a moment."""
         return round((moment - self.start) * self.rate)
 
     def following(self, moment: float) -> int:
-        """Return the first frame that is due at a moment or after it."""
+        """Return the first frame that is due at or after a moment."""
         return math.ceil((moment - self.start) * self.rate)
 
 
 class Camera:
-    """A process with a `Broadcast`, so that frames are sent on time regardless of other work; a context manager.
+    """A process with a `Broadcast`, which sends frames on time regardless of other work; a context manager.
 
     urls : URL of each stream
     """
@@ -82,7 +82,7 @@ class Camera:
         return float(self._receive())
 
     def play(self, schedule: Schedule) -> list[Schedule]:
-        """Send the images by a schedule; return the schedule of each stream."""
+        """Begin a schedule; return the schedule of each stream."""
         self._pipe.send(schedule)
         return list(self._receive())
 
@@ -124,10 +124,10 @@ _PROTOCOLS: dict[str, tuple[str, type[StreamRequestHandler]]] = {
 class Broadcast(ThreadingTCPServer):
     """Serves streams of the same video on the loopback interface; a context manager.
 
-    `units` are JPEG files for the source mjpeg, and access units for h264, which are sent over and over. `still` is
-    sent before them: a keyframe takes several times as long to decode as the frames after it that show no change.
+    `units` are JPEG files for the source mjpeg, and access units for h264, which are sent in a loop. `still` is sent
+    before: decoding a keyframe takes several times as long as decoding the unchanged frames after it.
 
-    The schedules of n streams are shifted by 1/n of a frame each, so that frames are not due at the same time.
+    The schedules of n streams are shifted by 1/n of a frame each, so their frames are due at different times.
 
     size : (width, height) of an image
     urls : URL of each stream
@@ -148,7 +148,7 @@ class Broadcast(ThreadingTCPServer):
         self.urls = [f"{protocol}://127.0.0.1:{self.server_address[1]}/{number}" for number in range(streams)]
 
     def play(self, schedule: Schedule) -> list[Schedule]:
-        """Start to send the images by a schedule; return the schedule of each stream."""
+        """Begin a schedule; return the schedule of each stream."""
         step = 1 / (schedule.rate * len(self.urls))
         self._schedules = [replace(schedule, start=schedule.start + number * step) for number in range(len(self.urls))]
         self.late = 0.0
@@ -164,7 +164,7 @@ class Broadcast(ThreadingTCPServer):
         self.server_close()
 
     def frames(self, stream: int) -> Iterator[tuple[float, bytes]]:
-        """Yield due time and access unit of each frame when it is due, by the newest schedule."""
+        """Yield the due time and the access unit of each frame when it is due, by the newest schedule."""
         while not self._closed.is_set():
             current = self._schedules[stream]
             schedule = replace(current, start=monotonic()) if math.isinf(current.start) else current

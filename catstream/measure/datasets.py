@@ -10,10 +10,10 @@ opens, and one of these files:
                            LaSOT and GOT-10k
     FOLDER.txt             Princeton: x,y,w,h,occluded, and the frames in rgb/
 
-Each file has one line for each frame; NaN, or a box without area, means that
-the object is absent. So do the flags of a data set beside the file, since boxes
-of frames without the object repeat the last one: see `_ABSENCE`. Boxes are used
-as published; OTB's pixel coordinates, which start at 1, are not shifted.
+Each file has one line for each frame. The object is absent if its box is NaN or
+has no area, or by the flag files of a data set, in which boxes of frames without
+the object repeat the last one: see `_ABSENCE`. Boxes are used as published; OTB's
+pixel coordinates, which start at 1, are not shifted.
 """
 
 from __future__ import annotations
@@ -33,12 +33,11 @@ from catstream.measure.scores import present
 from catstream.video.images import natural_order
 from catstream.video.source import open_source
 
-#: First annotated frame of the OTB sequences whose ground truth starts later than their images, by name and number of
-#: boxes.
+#: First annotated frame of OTB sequences with more images than boxes, by name and number of boxes.
 _FIRST_FRAMES = {("david", 471): 299}
 _RECT = re.compile(r"groundtruth_rect(\.\d+)?\.txt")
 
-#: Files with a number for each frame that say in which frames the object is absent, and the test of a number.
+#: Files with a number for each frame, and the test of a number for the absence of the object.
 _ABSENCE: dict[str, Callable[[Float64], Bool]] = {
     **dict.fromkeys(("full_occlusion.txt", "out_of_view.txt"), lambda flags: flags != 0),  # LaSOT
     "absence.label": lambda flags: flags != 0,  # GOT-10k
@@ -54,7 +53,7 @@ class Sequence:
     name   name of its folder
     path   the folder
     boxes  ground truth, float64 (frames, 4), x, y, w, h in pixels; NaN if the object is absent
-    begin  frame of the source that the first box belongs to
+    begin  frame of the first box in the source
     """
 
     name: str
@@ -67,11 +66,11 @@ class Sequence:
 
     @property
     def present(self) -> Bool:
-        """Whether each frame shows the object, bool (frames,)."""
+        """True for each frame with the object, bool (frames,)."""
         return present(self.boxes)
 
     def since(self, frame: int) -> Sequence:
-        """Return the part from a frame on, under the same name."""
+        """Return the part from a frame on, with the same name."""
         return Sequence(self.name, self.path, self.boxes[frame:], self.begin + frame)
 
     def frames(self) -> Generator[UInt8]:
@@ -90,10 +89,9 @@ class Sequence:
 
 
 def find_sequences(*paths: str | Path, failed: Callable[[VideoError], None] | None = None) -> list[Sequence]:
-    """Return the sequence in each folder, or the sequences in its subfolders, in natural order; each once.
+    """Return the unique sequences in folders or in their subfolders, in natural order.
 
-    failed : function that is called with the error of each sequence that cannot be read, while the others are; if None,
-        the error is raised
+    failed : function that is called with the error of each sequence that cannot be read; if None, the error is raised
     """
     truths: dict[Path, _Truth] = {}  # by the file
     for path in map(Path, paths):
@@ -119,7 +117,7 @@ def find_sequences(*paths: str | Path, failed: Callable[[VideoError], None] | No
 
 
 class _Layout(NamedTuple):
-    """The layout of a ground truth: a line in words, the possible numbers of columns, and the way to boxes."""
+    """The layout of a ground truth: description of a line, possible numbers of columns, and conversion to boxes."""
 
     line: str
     columns: Collection[int]
@@ -164,7 +162,7 @@ class _Truth(NamedTuple):
 def _truths(folder: Path) -> list[_Truth]:
     """Return the ground truth of each sequence in a folder."""
     target = folder.resolve()
-    name = target.name if folder.name in ("", "..") else folder.name  # a symbolic link has its own
+    name = target.name if folder.name in ("", "..") else folder.name  # the name of a symbolic link, not its target's
     rects = [
         file
         for file in sorted(folder.glob("*.txt"), key=natural_order)
@@ -230,7 +228,7 @@ def _numbers(file: Path, layout: _Layout) -> Float64:
     """Read the table in a text file, float64 (lines, columns)."""
     rows: list[list[float]] = []
     for number, line in enumerate(_text(file).splitlines(), start=1):
-        if not line.strip():  # skipping the line would shift all later boxes by one frame
+        if not line.strip():  # skipping it would shift all later boxes by one frame
             raise VideoError(f"{str(file)!r}, line {number} is blank: if the object is absent, write nan,nan,nan,nan")
         try:
             row = [float(field) for field in re.split(r"\s*[,;]\s*|\s+", line.strip(" \t,;"))]

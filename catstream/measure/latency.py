@@ -1,8 +1,8 @@
-"""Observations of a stream under load, and their measures; and the use of processor and memory.
+"""Latencies of a stream under load, and the use of processor and memory.
 
-Every due frame counts once, tracked or skipped. Its track latency ends with the first track of this frame or a newer
-one; its model latency ends with the first model whose training sample includes this frame or a newer one. Thus a
-pipeline does not get better figures by skipping frames while it is slow (no coordinated omission).
+Every due frame counts once, tracked or skipped. Its track latency ends with the first track of this or a newer frame;
+its model latency ends with the first model whose training sample includes this or a newer frame. Therefore skipping
+frames while a pipeline is slow does not improve its figures (no coordinated omission).
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ from catstream.measure.rtsp import due_time
 from catstream.measure.scores import overlaps, present
 from catstream.wire.messages import Model, Track
 
-#: The percentiles of latencies that are reported, by name.
+#: The reported percentiles of latencies, by name.
 PERCENTILES = {"p50": 50.0, "p95": 95.0, "p99": 99.0, "p99.9": 99.9, "max": 100.0}
 
-#: Name of the load by other processes of this machine. If it is high, the figures of a load test are unreliable.
+#: Name for other processes of this machine. If their load is high, the figures of a load test are unreliable.
 REST = "everything else"
 
 _POLL_SECONDS = 0.1
-_MEMORY_SECONDS = 5.0  # between two readings of memory
-_SUCCESS = 0.5  # a frame with a larger IoU is a success
+_MEMORY_SECONDS = 5.0  # interval between two readings of memory
+_SUCCESS = 0.5  # IoU above which a frame is a success
 
 
 @dataclass(slots=True)
@@ -42,18 +42,18 @@ class Observations:
     """The messages of one pipeline with their arrival times by `time.monotonic`, oldest first.
 
     tracks  tracks of frames with a time stamp, in order of arrival, each with the due time of its frame as `pts`
-    models  due time of the newest training frame of each model; of a frame whose track has not arrived, there is none
+    models  due time of the newest training frame of each model, if its track has arrived
     first_motion_version  version of the first model with a motion model, 0 before it
     """
 
     tracks: list[tuple[float, Track]] = field(default_factory=list)
     models: list[tuple[float, float]] = field(default_factory=list)
     first_motion_version: int = 0
-    _due: dict[int, float] = field(default_factory=dict)  # of the newest frame with a number: a restart repeats some
+    _due: dict[int, float] = field(default_factory=dict)  # by frame number; a restarted detector may reuse numbers
 
     @property
     def warmed_up(self) -> bool:
-        """True if the start-up phase is over: the detector uses a model with a motion model."""
+        """True once the detector uses a model with a motion model."""
         first = self.first_motion_version
         return first > 0 and bool(self.tracks) and self.tracks[-1][1].model_version >= first
 
@@ -71,7 +71,7 @@ class Observations:
 
 @contextmanager
 def observed(address: Address, name: str) -> Iterator[Observations]:
-    """Observe one object of a pipeline in threads, which end with the context or with the pipeline."""
+    """Observe one object of a pipeline in threads until the context or the pipeline ends."""
     observations, ended = Observations(), Event()
 
     def observe(channel: str) -> None:
@@ -105,11 +105,11 @@ class Measures:
 
     due              due time of each frame, float64 (frames,)
     tracked          whether each frame has a track, bool (frames,)
-    track            seconds from the due time of each frame to the track of this frame or a newer one; at most to the
-                     end of the run
-    model            seconds to the model trained on this frame or a newer one
-    success          share of the frames with a visible object for which the IoU of box and ground truth, or box of the
-                     unloaded run, is above 0.5; a skipped frame has the box of the last tracked frame
+    track            seconds from the due time of each frame to the track of this or a newer frame, or to the end of the
+                     run
+    model            seconds to the model trained on this or a newer frame
+    success          share of frames with the object whose box has an IoU above 0.5 with the ground truth or with the
+                     unloaded run; a skipped frame has the box of the last tracked frame
     totals           totals of the pipeline at its end; empty if the stream has not ended
     """
 
@@ -122,7 +122,7 @@ class Measures:
 
     @property
     def skipped(self) -> float:
-        """Share of frames without a track of their own."""
+        """Share of frames without a track."""
         return 1 - float(self.tracked.mean())
 
     @property
@@ -134,13 +134,13 @@ class Measures:
 
 @dataclass(slots=True)
 class Receipts:
-    """The measures of the fast subscribers to one channel of a stream, at least one.
+    """The measures of one or more fast subscribers to a channel of a stream.
 
-    latency   seconds from the due time of each frame to the receipt of a message of this frame or a newer one; at most
-              to the end of the run; float32 (subscribers, frames)
-    received  number of frames of which each subscriber has received a message since it connected
-    missed    number of frames of which each subscriber has missed all messages, by the gaps in `frame`; 0 on a channel
-              that keeps only the newest message
+    latency   seconds from the due time of each frame to the receipt of a message of this or a newer frame, or to the
+              end of the run; float32 (subscribers, frames)
+    received  number of received frames of each subscriber since it connected
+    missed    number of missed frames of each subscriber, by the gaps in `frame`; 0 on a channel that keeps only the
+              newest message
     """
 
     stream: int
@@ -167,20 +167,22 @@ def measure(
 ) -> Measures:
     """Compute the measures of one stream.
 
-    frames : number of due frames: all of the schedule of the camera, or those before an interruption
-    truth : boxes of the object in the first frames, float64 (n, 4), NaN if it is absent; the last `images` of them, by
+    frames : number of due frames, up to an interruption
+    truth : boxes of the object in the first frames, float64 (n, 4), NaN if it is absent; the last `images` boxes, by
         default all, are repeated
     end : time at which the observation ended
     totals : totals of the pipeline at its end
     """
+    # Step 1: the box of each frame; a skipped frame has the box of the last tracked frame.
     due = schedule.due_times(frames)
     tracks = [(moment, schedule.number(track.pts or 0.0)) for moment, track in observations.tracks]
     tracked = np.isin(np.arange(frames), [number for _, number in tracks])
-    boxes = np.full((frames + 1, 4), np.nan)  # one more, without a box, for the frames before the first tracked one
+    boxes = np.full((frames + 1, 4), np.nan)  # the last row, NaN, is for frames before the first tracked one
     for (_, number), (_, track) in zip(tracks, observations.tracks, strict=True):
         if 0 <= number < frames:
             boxes[number] = track.box or np.nan
     last = np.maximum.accumulate(np.where(tracked, np.arange(frames), -1))
+    # Step 2: compare with the ground truth, which repeats with the video.
     period = images or len(truth)
     once, numbers = len(truth) - period, np.arange(frames)
     true = truth[np.where(numbers < once, numbers, once + (numbers - once) % period)]
@@ -191,13 +193,13 @@ def measure(
         tracked=tracked,
         track=latencies_to_answer(due, tracks, end),
         model=latencies_to_answer(due, models, end),
-        success=float(is_success.mean()) if is_success.size else 1.0,  # an interrupted run may end before the object
+        success=float(is_success.mean()) if is_success.size else 1.0,  # interrupted before a frame with the object
         totals=totals,
     )
 
 
 def percentiles(seconds: np.ndarray) -> dict[str, float]:
-    """Return the `PERCENTILES` of at least one latency; each of them is the latency of a frame.
+    """Return the `PERCENTILES` of one or more latencies, without interpolation.
 
     >>> percentiles(np.array([0.010] * 98 + [0.5, 2.0]))["p99"]
     0.5
@@ -211,7 +213,7 @@ def latencies_to_answer(due: Float64, answers: list[tuple[float, int]], end: flo
 
     due : due times, float64 (frames,)
     answers : arrival time and frame number of each answer
-    end : arrival time that is assumed for frames without an answer
+    end : assumed arrival time for frames without an answer
 
     >>> latencies_to_answer(np.array([0.0, 1.0, 2.0, 3.0]), [(0.5, 0), (2.5, 2)], end=9.0)
     array([0.5, 1.5, 0.5, 6. ])
@@ -219,8 +221,8 @@ def latencies_to_answer(due: Float64, answers: list[tuple[float, int]], end: flo
     first = np.full(len(due), np.inf)
     for moment, number in answers:
         if number >= 0:
-            place = min(number, len(due) - 1)
-            first[place] = min(first[place], moment)
+            index = min(number, len(due) - 1)
+            first[index] = min(first[index], moment)
     first = np.minimum.accumulate(first[::-1])[::-1]
     return np.asarray(np.minimum(first, end) - due)
 
@@ -229,9 +231,9 @@ class Reading(NamedTuple):
     """The use of the processor and of memory by named groups of processes.
 
     moment   time by `time.monotonic`
-    seconds  since the reading before
+    seconds  seconds since the previous reading
     cores    mean number of busy cores since then by name, and of `REST`
-    memory   bytes by name, in which a page that n processes share counts as 1/n (PSS); empty if they were not read
+    memory   proportional set size (PSS) in bytes by name; empty if it was not read
     """
 
     moment: float
@@ -241,24 +243,24 @@ class Reading(NamedTuple):
 
 
 class Usage:
-    """Readings of named groups of processes, oldest first; after a restart, the process ids of a group may change.
+    """Readings of named groups of processes, oldest first; the process ids of a group may change.
 
-    Memory is read every five seconds, because the kernel takes milliseconds for each process.
+    Memory is read every five seconds, because each process takes the kernel milliseconds.
     """
 
     def __init__(self) -> None:
         self.readings: list[Reading] = []
-        self._processes: dict[int, psutil.Process] = {}  # psutil keeps the processor time of the previous reading in it
+        self._processes: dict[int, psutil.Process] = {}  # store the processor time of the previous reading
         self._moment = self._memory_at = 0.0
 
     def read(self, groups: Mapping[str, Iterable[int]], *, is_last: bool = False) -> None:
         """Add a reading of groups of process ids; the first call only starts the measurement."""
-        is_first, before, self._moment = not self._processes, self._moment, monotonic()
+        is_first, previous, self._moment = not self._processes, self._moment, monotonic()
         all_cores = psutil.cpu_percent() / 100 * (psutil.cpu_count() or 1)
         cores, memory = dict.fromkeys(groups, 0.0), dict.fromkeys(groups, 0)
         with_memory = not is_first and (is_last or self._moment >= self._memory_at)
         for name, pid in ((name, pid) for name, pids in groups.items() for pid in pids):
-            with suppress(psutil.Error):  # it has just ended
+            with suppress(psutil.Error):  # the process has just ended
                 process = self._processes.setdefault(pid, psutil.Process(pid))
                 cores[name] += process.cpu_percent() / 100
                 memory[name] += process.memory_full_info().pss if with_memory else 0
@@ -267,4 +269,4 @@ class Usage:
         if with_memory:
             self._memory_at = self._moment + _MEMORY_SECONDS
         cores[REST] = max(0.0, all_cores - sum(cores.values()))
-        self.readings.append(Reading(self._moment, self._moment - before, cores, memory if with_memory else {}))
+        self.readings.append(Reading(self._moment, self._moment - previous, cores, memory if with_memory else {}))

@@ -1,4 +1,4 @@
-"""The load: a pipeline for each stream of the camera."""
+"""The load of a load test: a pipeline for each stream of the camera."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ STOP_SECONDS = 30.0
 class Stream(threading.Thread):
     """Runs a pipeline until `stop` is called: consumes its tracks and supervises its processes.
 
-    ready : event that is set when the processes are started, or the pipeline has failed
-    address : of the pipeline, set when it has started
-    error : the error of a failed pipeline, else None
-    totals : as in `Pipeline`, set at the end
+    ready : event that is set once the pipeline has started or failed
+    address : address of the pipeline, set once it has started
+    error : error of a failed pipeline, or None
+    totals : totals of the pipeline, set at its end
     """
 
     address: Address
@@ -34,7 +34,7 @@ class Stream(threading.Thread):
         self.error: CatstreamError | None = None
         self.totals: dict[str, int] = {}
         self._url, self._video = url, video
-        self._settings = settings.replace({"run.endpoint": ""})  # each pipeline has its own
+        self._settings = settings.replace({"run.endpoint": ""})  # a private endpoint for each pipeline
         self._pipeline: Pipeline | None = None
 
     def run(self) -> None:
@@ -59,11 +59,11 @@ class Stream(threading.Thread):
         return pipeline.pids if pipeline is not None else {}
 
     def stop(self) -> None:
-        """End the run as if its source had ended; `join` waits until everything learned is stored."""
+        """End the run as if its source had ended; `join` waits until all features are stored."""
         self.ready.wait(STOP_SECONDS)
         if self._pipeline is not None:
             with (
-                suppress(CommandRejectedError, SilenceError),  # it has ended by itself
+                suppress(CommandRejectedError, SilenceError),  # it has already ended
                 control(self.address, timeout=STOP_SECONDS) as pipeline,
             ):
                 pipeline.stop()

@@ -13,10 +13,10 @@ from catstream.errors import SettingsError
 class Change(NamedTuple):
     """A figure of two results.
 
-    name           as of a limit; or `cores` and `memory`, of a stream, or what was searched for
+    name           name of a limit, `cores` or `memory` of a stream, or the searched parameter
     before, after  its values, in seconds, bytes, or a share from 0 to 1
-    worse          by which share of `before` it is worse, negative if it is better; infinite if it was 0
-    is_regression  whether this is more than the tolerance
+    worse          relative change for the worse, negative if it is better; infinite if `before` is 0
+    is_regression  whether `worse` exceeds the tolerance
     """
 
     name: str
@@ -27,7 +27,7 @@ class Change(NamedTuple):
 
 
 def read_result(path: Path) -> dict[str, Any]:
-    """Read the JSON file of a load test. SettingsError if it is none."""
+    """Read the JSON file of a load test; SettingsError if it is invalid."""
     try:
         result: dict[str, Any] = json.loads(path.read_bytes())
         _ = result["plan"]["rate"], result["figures"]["p99"], result["find"], result["highest"], result["settings"]
@@ -41,10 +41,10 @@ def read_result(path: Path) -> dict[str, Any]:
 def compare(before: dict[str, Any], after: dict[str, Any], tolerance: float) -> list[Change]:
     """Return the figures of two results of the same plan.
 
-    p99.9 and max are never a regression, because they are the latencies of single frames. Of two searches, the numbers
-    that they have found are compared. Raises SettingsError for different plans.
+    p99.9 and max are never a regression, because they are latencies of single frames. For two searches, the highest
+    numbers are compared. Raises SettingsError for different plans.
 
-    tolerance : share by which a figure may be worse
+    tolerance : relative change for the worse that is not a regression
     """
     find = before["find"]
     plans = [

@@ -1,4 +1,4 @@
-"""The results of a load test: tables of text, an HTML file, and JSON."""
+"""The results of a load test as text tables, HTML and JSON."""
 
 from __future__ import annotations
 
@@ -19,23 +19,23 @@ from catstream.output.report import COLOURS, round_up, write_page
 
 
 class Table(NamedTuple):
-    """A table of text: its title, rows of cells by the heads of their columns, and an explanation of the columns."""
+    """A table of text: title, rows of cells by column header, and an explanation of the columns."""
 
     title: str
     rows: list[dict[str, str]]
     note: str
 
     @property
-    def heads(self) -> list[str]:
+    def headers(self) -> list[str]:
         return list(self.rows[0])
 
     @property
     def cells(self) -> list[list[str]]:
-        return [[row.get(head, "") for head in self.heads] for row in self.rows]
+        return [[row.get(header, "") for header in self.headers] for row in self.rows]
 
 
 def tables(result: Result) -> Iterator[Table]:
-    """Yield the tables of a run: streams, processes and, if there were any, subscribers."""
+    """Yield the tables of a run: streams, processes and subscribers."""
     streams = [
         {
             "stream": str(number),
@@ -83,7 +83,7 @@ def tables(result: Result) -> Iterator[Table]:
 
 
 class Panel(NamedTuple):
-    """A part of the chart over time: its title, the value at its upper end, and curves by name, in 1000 x 100 units."""
+    """A panel of the chart over time: title, value at its upper edge, and curves by name, in 1000 x 100 units."""
 
     title: str
     top: float
@@ -91,9 +91,9 @@ class Panel(NamedTuple):
 
 
 def panels(over_time: dict[str, list[float]], due: float) -> Iterator[Panel]:
-    """Yield the parts of the chart, which share the axis of time; `due` is the number of frames per second."""
+    """Yield the panels of the chart, which share a time axis; `due` is the number of due frames per second."""
     figures = {name: np.array(values) for name, values in over_time.items()}
-    x = 1000 * (np.arange(len(figures["seconds"])) + 0.5) / len(figures["seconds"])  # the middle of each interval
+    x = 1000 * (np.arange(len(figures["seconds"])) + 0.5) / len(figures["seconds"])  # centres of the intervals
     latencies = {
         name.replace("-", " at subscribers, "): 1000 * values
         for name, values in figures.items()
@@ -112,7 +112,7 @@ def panels(over_time: dict[str, list[float]], due: float) -> Iterator[Panel]:
 
 
 def write_raw(path: Path, result: Result) -> None:
-    """Write a CSV file with a row for each frame and each receiver: the load test itself, or a fast subscriber."""
+    """Write a CSV file with a row for each frame and each receiver, the load test or a fast subscriber."""
 
     def rows() -> Iterator[tuple[object, ...]]:
         for number, stream in enumerate(result.streams):
@@ -126,8 +126,8 @@ def write_raw(path: Path, result: Result) -> None:
                 for frame, seconds in zip(frames, latency, strict=True):
                     yield number, channel, subscriber, *frame, f"{seconds:.6f}"
 
-    heads = ("stream", "channel", "subscriber", "frame", "due_seconds", "tracked", "latency_seconds")
-    write_table(path, heads, rows())
+    columns = ("stream", "channel", "subscriber", "frame", "due_seconds", "tracked", "latency_seconds")
+    write_table(path, columns, rows())
 
 
 def milliseconds(seconds: float) -> str:
@@ -250,7 +250,7 @@ def write_report(path: Path, load_test: LoadTest, provenance: dict[str, object])
 
 
 def verdict(load_test: LoadTest) -> str:
-    """State in one sentence whether the load was sustained, or the highest number that was, with its costs."""
+    """Describe whether the load was sustained, or the highest sustained number and its costs."""
     result = load_test.result
     if load_test.find and load_test.highest:
         is_least = load_test.interrupted or load_test.highest == SEARCHES[load_test.find]

@@ -1,4 +1,4 @@
-"""The plan of a run of a load test, its results, and the limits that they have to meet."""
+"""The plan, the results and the limits of a load test."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from catstream.errors import SettingsError
 from catstream.measure.latency import PERCENTILES, REST, Measures, Reading, Receipts
 from catstream.video import rendered
 
-#: The figures that can have a limit, by name. If there are several streams, the worst one counts.
+#: The figures that can have a limit, by name. With several streams, the limit applies to the worst one.
 KINDS = {
     **dict.fromkeys(PERCENTILES, "from a frame to its track"),
     **{f"model-{name}": "from a frame to the model trained on it" for name in PERCENTILES},
@@ -27,13 +27,13 @@ KINDS = {
     "subscriber-missed": "share of frames that fast subscribers missed",
     "success": "share of frames with an IoU above 0.5",
 }
-#: Those that are shares; the others are times.
+#: The figures that are shares; the others are times.
 SHARES = ("skipped", "subscriber-missed", "success")
 
 #: The parameters that a search can maximise, by name, with the upper bound of the search.
 SEARCHES = {"streams": 64, "rate": 1000, "subscribers": 1000}
 
-#: Is called about ten times a second with the current activity, the share of it that is done, and current figures.
+#: Called about ten times a second with the current activity, its progress from 0 to 1, and current figures.
 Report = Callable[[str, float, str], None]
 
 
@@ -44,12 +44,12 @@ class Plan:
     streams           number of pipelines, each of three processes
     objects           number of objects that each pipeline tracks
     subscribers       number of subscribers to each of the channels of each stream
-    slow_subscribers  number of slow ones among them
+    slow_subscribers  number of slow subscribers among them
     channels          channels of the subscribers
-    rate              frames per second of each stream, whether or not the pipeline keeps up
+    rate              frames per second of each stream, even if the pipeline cannot keep up
     duration          seconds
     size              (width, height) of a frame in pixels
-    video             recording that the camera sends over and over; empty for the rendered video
+    video             recording that the camera sends in a loop; empty for the rendered video
     boxes, models     objects of the recording: boxes in its first frame, and files of saved models, by name
     source            "mjpeg" (over HTTP) or "h264" (over RTSP)
     warm_up           whether the training of the first models is measured as well
@@ -98,7 +98,7 @@ class Plan:
         return f"{counted(self.streams, 'stream')} of {video}{objects}, {self.rate:g} frames/s due in each{subscribers}"
 
     def number(self, name: str) -> str:
-        """One of the `SEARCHES` with its unit."""
+        """Format the value of one of the `SEARCHES` with its unit."""
         return f"{self.rate:g} frames/s" if name == "rate" else counted(getattr(self, name), name.removesuffix("s"))
 
     @property
@@ -115,11 +115,11 @@ class Result:
     """The results of one run.
 
     plan         parameters of the run
-    seconds      duration of the measured frames: less than planned if the run was interrupted
+    seconds      duration of the measured frames, shorter if the run was interrupted
     streams      measures of each stream
-    readings     use of the processor and of memory by each process, and of the processor by other ones
+    readings     processor and memory use of each process, and processor use of other processes
     subscribers  measures of the fast subscribers to each channel of each stream
-    camera_late  largest delay in seconds of a frame that the camera itself caused
+    camera_late  largest delay in seconds of a frame that the camera caused
     errors       errors of failed streams
     interrupted  whether the run was interrupted
     """
@@ -135,7 +135,7 @@ class Result:
 
     @property
     def worst(self) -> dict[str, float]:
-        """The value of each of the `KINDS`; without fast subscribers, theirs are 0."""
+        """The worst value of each of the `KINDS`; 0 for subscribers if there are no fast ones."""
         worst = dict.fromkeys(KINDS, 0.0) | {"success": 1.0}
         for figures in [stream.figures for stream in self.streams] + [each.figures for each in self.subscribers]:
             for name, value in figures.items():
@@ -152,7 +152,7 @@ class Result:
         return np.concatenate([stream.model for stream in self.streams])
 
     def rate(self, skipped: float) -> float:
-        """Return the tracked frames per second if this share was skipped."""
+        """Return the tracked frames per second for a share of skipped frames."""
         return self.plan.rate * (1 - skipped)
 
     @property
@@ -164,11 +164,11 @@ class Result:
 
     @property
     def memory(self) -> dict[str, int]:
-        """Bytes of each process at the end, in which a shared page counts in proportion (PSS)."""
+        """Proportional set size (PSS) of each process at the end, in bytes."""
         return self.readings[-1].memory
 
     def cost(self, number: int) -> tuple[float, int]:
-        """Return the processor seconds per second, and the bytes of memory, of the processes of a stream."""
+        """Return the processor seconds per second and the memory in bytes of the processes of a stream."""
         of_stream = f" {number}"
         cores = sum(cores for name, cores in self.cores.items() if name.endswith(of_stream))
         return cores, sum(size for name, size in self.memory.items() if name.endswith(of_stream))
@@ -186,7 +186,7 @@ class Result:
 
 @dataclass(frozen=True, slots=True)
 class Limit:
-    """A limit on one of the `KINDS`: a minimum of the success, a maximum of the others.
+    """A limit on one of the `KINDS`: a minimum for the success, a maximum for all others.
 
     >>> Limit.parse("p99=0.1"), Limit.parse("skipped=1%")
     (Limit(name='p99', value=0.1), Limit(name='skipped', value=0.01))
@@ -197,7 +197,7 @@ class Limit:
 
     @classmethod
     def parse(cls, text: str) -> Limit:
-        """Read `NAME=VALUE`; times are in seconds, or end with `ms`, and shares may end with `%`."""
+        """Parse `NAME=VALUE`; times are in seconds, or end with `ms`, and shares may end with `%`."""
         name, _, number = text.partition("=")
         unit, factor = ("%", 0.01) if name in SHARES else ("ms", 0.001)
         try:
@@ -212,9 +212,9 @@ class Limit:
 
     @classmethod
     def defaults(cls, plan: Plan, find: str | None = None) -> list[Limit]:
-        """Return the limits of a load test without any: p99 of 0.1 s, no skipped frame (1 % with the warm-up).
+        """Return the default limits: p99 of 0.1 s, no skipped frame (1 % with the warm-up).
 
-        In a search for the number of subscribers, the same holds for their p99 and the frames that they miss.
+        In a search for the number of subscribers, also their p99 of 0.1 s and no missed frame.
         """
         limits = [cls("p99", 0.1), cls("skipped", 0.01 if plan.warm_up else 0.0)]
         return limits + [cls("subscriber-p99", 0.1), cls("subscriber-missed", 0.0)] * (find == "subscribers")
@@ -224,7 +224,7 @@ class Limit:
         return value >= self.value if self.name == "success" else value <= self.value
 
     def describe(self, result: Result) -> str:
-        """The figure and its limit, times in milliseconds, as in the tables."""
+        """Describe the figure and its limit, with times in milliseconds."""
         value, limit = (
             f"{number:.4g}" if self.name in SHARES else f"{1000 * number:.4g} ms"
             for number in (result.worst[self.name], self.value)
@@ -234,5 +234,5 @@ class Limit:
 
 
 def violations(limits: Iterable[Limit], result: Result) -> list[str]:
-    """Return a line for each stream that failed and each limit that was not met."""
+    """Return a line for each failed stream and each exceeded limit."""
     return [*result.errors, *(limit.describe(result) for limit in limits if not limit.is_met(result))]

@@ -21,19 +21,20 @@ from catstream.measure.load_video import Video, prepare
 from catstream.measure.subscribers import Subscribers
 
 _START_TIMEOUT_SECONDS = 120.0  # for each phase of the start
-_LEAD_SECONDS = 0.5  # from the end of the start to the first frame, and half a frame: a still is no nearer to it
-_GRACE_SECONDS = 3.0  # to wait for the track of the last frame
-_READING_SECONDS = 1.0  # between two readings of processor and memory use
+_LEAD_SECONDS = 0.5  # delay of the first frame; half a frame is added, so no still image has its number
+_GRACE_SECONDS = 3.0  # timeout for the track of the last frame
+_READING_SECONDS = 1.0  # interval between two readings of processor and memory use
 _LOOP_SECONDS = 0.05
-_PRECISION = 0.05  # share by which the result of a search may be too low
-_SEARCH_FRAMES = 1200  # of the video in a search for the rate: the whole rendered video
-_FIRST_SUBSCRIBERS = 50  # of a search without another number
+_PRECISION = 0.05  # maximum relative error of the result of a search
+_SEARCH_FRAMES = 1200  # frames of the video in a search for the rate: the whole rendered video
+_FIRST_SUBSCRIBERS = 50  # default start of a search for the number of subscribers
 
 
 def run(plan: Plan, video: Video, report: Report) -> Result:
     """Run a camera and pipelines on its streams, and measure; after Ctrl-C, return the measurements so far."""
     usage, interrupted = Usage(), False
     with ExitStack() as stack:
+        # Step 1: start the camera, the pipelines and the subscribers.
         camera = stack.enter_context(Camera(plan.source, plan.size, video.units, video.still, plan.streams))
         streams = [Stream(number, url, video, plan.settings) for number, url in enumerate(camera.urls)]
         observations, groups = _started(plan, streams, video, stack, report)
@@ -44,6 +45,7 @@ def run(plan: Plan, video: Video, report: Report) -> Result:
                 pids["subscribers"] = readers
             return pids | {"camera": [camera.pid], "load test": [getpid()]}
 
+        # Step 2: begin the schedule, and read the processor and memory use until the last track.
         schedules = camera.play(Schedule(monotonic() + _LEAD_SECONDS + 0.5 / plan.rate, plan.rate))
         usage.read(processes())
         next_reading = schedules[0].start + _READING_SECONDS
@@ -57,6 +59,7 @@ def run(plan: Plan, video: Video, report: Report) -> Result:
                 report(f"{plan.frames * plan.streams} frames", min(max(passed, 0.0), 1.0), tracks)
         except KeyboardInterrupt:
             interrupted = True
+        # Step 3: stop the pipelines, and compute the measures.
         end, late = monotonic(), camera.late
         usage.read(processes(), is_last=True)
         report("ending", 1.0, "")
@@ -84,7 +87,7 @@ def run(plan: Plan, video: Video, report: Report) -> Result:
 def _started(
     plan: Plan, streams: list[Stream], video: Video, stack: ExitStack, report: Report
 ) -> tuple[list[Observations], list[Subscribers]]:
-    """Start one pipeline after the other, each with its first models, then the subscribers; the stack ends all."""
+    """Start one pipeline after the other until it has its first models, then the subscribers; the stack ends them."""
     started: list[Stream] = []
     observations: list[Observations] = []
 
@@ -104,7 +107,7 @@ def _started(
                     raise stream.error
 
     stack.callback(_stop, started)
-    # The object of a saved model need not be in the first frame, so that nothing may be learned from it.
+    # The object of a saved model need not be in the still image, from which the first models would be trained.
     counts_from_first_track = plan.warm_up or not video.boxes
 
     def has_begun(stream: Observations) -> bool:
@@ -127,7 +130,7 @@ def _started(
 
 
 def _stop(streams: list[Stream]) -> None:
-    """Stop all pipelines, and wait until they have ended, which they do concurrently and within some seconds."""
+    """Stop all pipelines concurrently, and wait until they have ended."""
     for stream in streams:
         stream.stop()
     for stream in streams:
@@ -137,9 +140,9 @@ def _stop(streams: list[Stream]) -> None:
 def _until_the_last_track(
     plan: Plan, streams: list[Stream], observations: list[Observations], schedules: list[Schedule]
 ) -> Iterator[float]:
-    """Yield the time twenty times a second.
+    """Yield the time twenty times a second until the last frame of each stream was tracked.
 
-    It ends if the last frame of each stream was tracked, if the grace time for it is over, or if all streams failed.
+    Ends after the grace time, or if all streams have failed.
     """
 
     def is_tracked(stream: Observations, schedule: Schedule) -> bool:
@@ -158,10 +161,10 @@ class LoadTest:
     """The runs of a load test.
 
     limits       the limits of each run
-    find         the parameter whose highest number is searched for, one of `SEARCHES`; None for a single run
-    results      all runs, in order; empty if it was interrupted before the first measurement
-    refused      reasons why streams did not start, by the number that was tried
-    interrupted  whether it was interrupted
+    find         parameter to maximise, one of `SEARCHES`; None for a single run
+    results      all runs, in order; empty if the load test was interrupted before the first measurement
+    refused      reasons why streams did not start, by the tried number
+    interrupted  whether the load test was interrupted
     """
 
     limits: list[Limit]
@@ -171,12 +174,12 @@ class LoadTest:
     interrupted: bool = False
 
     def number(self, result: Result) -> int:
-        """The number of a run of the search."""
+        """The value of the searched parameter in a run."""
         return int(getattr(result.plan, self.find or "streams"))
 
     @property
     def result(self) -> Result:
-        """The decisive run: the last one with the highest number below all that failed, or the last one without any."""
+        """The decisive run: the last one with the highest number below all failed runs, or the last run."""
         runs = [result for result in self.results if not result.interrupted]
         failed = [self.number(result) for result in runs if violations(self.limits, result)]
         passed = [result for result in reversed(runs) if self.number(result) < min([*failed, *self.refused, inf])]
@@ -190,7 +193,7 @@ class LoadTest:
 
     @property
     def sustained(self) -> bool | None:
-        """True if no stream of the decisive run failed and it meets all limits; None if it was interrupted."""
+        """True if the decisive run meets all limits without a failed stream; None if it was interrupted."""
         return None if self.interrupted else not violations(self.limits, self.result)
 
 
@@ -204,7 +207,7 @@ def run_load_test(
 ) -> LoadTest:
     """Run a load test. After Ctrl-C, the measurements so far are returned.
 
-    find : search for the highest number of this parameter that meets the limits, beginning with the one in the plan
+    find : parameter whose highest value within the limits is searched, beginning with the value in the plan
     report, done : functions that are called with the progress, and after each run
     """
     has_fast = plan.fast_subscribers or find == "subscribers"
@@ -242,10 +245,10 @@ def run_load_test(
 
 
 def find_highest(start: int, holds: Callable[[int], bool], most: int) -> int | None:
-    """Return the highest number from 1 to `most` for which `holds` is true twice; None if it is not even for 1.
+    """Return the highest number from 1 to `most` for which `holds` is true twice; None if it is false for 1.
 
-    The number is doubled or halved from `start` until the limit is between two numbers, and then bisected, to within
-    5 %. `holds` is called again for the result; if it is false then, the search continues below.
+    The number is doubled or halved from `start` until the limit is between two numbers, and then bisected to within
+    5 %. `holds` is called again for the result; if it is false, the search continues below.
 
     >>> find_highest(1, lambda streams: streams <= 17, most=64)
     17

@@ -1,4 +1,4 @@
-"""The video of a load test, rendered or a recording: the units that a camera sends, and the boxes to compare with."""
+"""The video of a load test, rendered or recorded: the units that a camera sends, and the reference boxes."""
 
 from __future__ import annotations
 
@@ -29,22 +29,22 @@ from catstream.video.writer import Encoder
 
 _log = logging.getLogger(__name__)
 
-_QUALITY = 90  # of JPEG, as network cameras use it
-_STILL_FRAMES = 24  # of which the first is a keyframe
-_MAX_BYTES = 1 << 30  # of a recording in memory; a longer one is repeated earlier
+_QUALITY = 90  # JPEG quality, typical of network cameras
+_STILL_FRAMES = 24  # the first one is a keyframe
+_MAX_BYTES = 1 << 30  # memory for a recording; a larger one is truncated and repeated
 _SLICE = rb"\x00\x00\x01[\x01\x21\x41\x61\x25\x45\x65]"  # start of a NAL unit with a slice
-_STEADY = 1.5  # longest interval between two frames, relative to the median, of a constant frame rate
+_STEADY = 1.5  # maximum interval between two frames, relative to the median, of a constant frame rate
 
 
 class Video(NamedTuple):
-    """The video that is sent over and over.
+    """The video that is sent in a loop.
 
-    units   JPEG files or access units of H.264, of which the first one is a keyframe
-    still   those of the first image over and over, which are sent before
+    units   JPEG files or access units of H.264; the first one is a keyframe
+    still   units of the repeated first image, which are sent before
     boxes   boxes of objects in the first image, by name; the tracks of the first object are measured
-    models  files of saved models of objects to search for, by name
-    truth   boxes of the first object, float64 (images, 4), NaN if it is absent: in each image, and for a recording,
-            which need not end as it begins, in the second repetition as well
+    models  saved models of searched objects, by name
+    truth   boxes of the first object, float64 (images, 4), NaN if it is absent: in each image and, for a recording, in
+            its repetition, where tracking may differ
     """
 
     units: list[bytes]
@@ -57,7 +57,7 @@ class Video(NamedTuple):
 def prepare(plan: Plan, frames: int, report: Report) -> Video:
     """Return the video of a plan, for a run of this number of frames.
 
-    Raises VideoError if a recording cannot be read, and SettingsError if the object is in none of its frames.
+    Raises VideoError if a recording cannot be read, and SettingsError if it does not contain the object.
     """
     return _recording(plan, frames, report) if plan.video else _rendering(plan, frames, report)
 
@@ -76,7 +76,7 @@ def _rendering(plan: Plan, frames: int, report: Report) -> Video:
     still, units = [*_encoded(plan, images([0] * _STILL_FRAMES))], [*_encoded(plan, images(range(count)))]
     boxes = {"object-1" if plan.objects > 1 else UNNAMED: cast(Box, truth[0])}  # the flower is visible
     x, y = plan.size[0] / rendered.SIZE[0], plan.size[1] / rendered.SIZE[1]
-    for n in range(plan.objects - 1):  # parts of the lake that stay in the picture
+    for n in range(plan.objects - 1):  # parts of the lake that remain in the picture
         boxes[f"object-{n + 2}"] = Box(x * (10 + 80 * (n % 4)), y * (110 + 85 * (n // 4)), 60 * x, 60 * y)
     return Video(units, still, boxes, {}, np.array([truth[number] or (np.nan,) * 4 for number in range(count)]))
 
@@ -92,10 +92,10 @@ def _encoded(plan: Plan, images: Iterable[np.ndarray]) -> Iterator[bytes]:
 
 
 def with_recording(plan: Plan, rate: float | None) -> Plan:
-    """Return the plan with the size and the number of objects of its recording, and its rate if none is passed.
+    """Return the plan with the size, the number of objects and, by default, the rate of its recording.
 
-    Raises VideoError if it has fewer than two frames or cannot be read, BoxError if a box is not in its first frame,
-    ObjectError without an object, SettingsError for a saved model that cannot be used.
+    Raises VideoError if it has fewer than two frames or cannot be read, BoxError if a box is outside its first frame,
+    ObjectError without an object, SettingsError for an unusable saved model.
     """
     if is_live(plan.video):
         raise VideoError(f"{plan.video} is a live source: record it to a file, and pass this file to --video")
@@ -138,9 +138,9 @@ def _recording(plan: Plan, frames: int, report: Report) -> Video:
 
 
 def _access_units(plan: Plan, file: VideoFile, frames: int) -> list[bytes]:
-    """Return the first access units of a recording as it is; none unless it is H.264 without B-frames, one slice each.
+    """Return the first access units of a recording in H.264 without B-frames and with one slice each, otherwise [].
 
-    A receiver that decodes without delay loses the stream if the number of slices changes after the still.
+    A receiver that decodes without delay loses the stream if the number of slices differs from the still image.
     """
     from av import Packet
     from av.bitstream import BitStreamFilterContext
@@ -162,7 +162,7 @@ def _access_units(plan: Plan, file: VideoFile, frames: int) -> list[bytes]:
 
 
 def _unloaded_run(plan: Plan, units: Iterable[bytes], report: Report) -> Iterator[tuple[float, ...]]:
-    """Yield the boxes of the first object in these frames, which a pipeline tracks in lockstep."""
+    """Track in lockstep, and yield the boxes of the first object."""
     settings = plan.settings.replace({"run.lockstep": True, "run.endpoint": ""})
     with TemporaryDirectory(prefix="catstream-") as folder:
         (file := Path(folder, f"video.{plan.source}")).write_bytes(b"".join(units))

@@ -1,4 +1,4 @@
-"""MJPEG over HTTP for the camera of a load test, in a NUT container, whose frames FFmpeg returns without delay."""
+"""MJPEG over HTTP for the camera of a load test, in a NUT container, which FFmpeg reads without delay."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ _TICKS_PER_SECOND = 1_000_000  # time base of the stream
 
 
 class MjpegConnection(BaseHTTPRequestHandler):
-    """The connection of one receiver: it sends frames until the receiver leaves."""
+    """The connection of one receiver: sends frames until the receiver disconnects."""
 
-    disable_nagle_algorithm = True  # otherwise the end of a frame waits 40 ms for a delayed acknowledgement
+    disable_nagle_algorithm = True  # otherwise the end of a frame would wait 40 ms for a delayed acknowledgement
 
     def do_GET(self) -> None:
         import av
@@ -35,7 +35,7 @@ class MjpegConnection(BaseHTTPRequestHandler):
                     break
 
     def write(self, data: bytes) -> int:
-        """Write for PyAV. An error is recorded: PyAV would raise it again at the end of the container."""
+        """Write for PyAV. An error is only recorded, because PyAV would raise it again at the end of the container."""
         try:
             self.wfile.write(data)
         except OSError:

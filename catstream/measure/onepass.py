@@ -22,7 +22,7 @@ from catstream.tracker import Tracker
 
 
 class SingleTracker(Protocol):
-    """The interface of a tracker of one object: that of OpenCV's trackers, and of `catstream.Tracker`."""
+    """The interface of a tracker of one object, as in OpenCV and `catstream.Tracker`."""
 
     def init(self, frame: np.ndarray, box: Box, /) -> Any: ...
 
@@ -33,9 +33,9 @@ class SingleTracker(Protocol):
 class Run:
     """The output of a tracker on a sequence, from the first frame with the object on.
 
-    sequence  from this frame on
-    boxes     float64 (frames, 4), the first as given; NaN if the tracker reported no box
-    seconds   float64 (frames,), time of the tracker alone, without reading the frame
+    sequence  sequence from this frame on
+    boxes     float64 (frames, 4), beginning with the initial box; NaN if the tracker reported no box
+    seconds   float64 (frames,), processing time of the tracker, without decoding
     """
 
     sequence: Sequence
@@ -52,20 +52,20 @@ class Run:
 
 
 def follow(sequence: Sequence, tracker: SingleTracker, box: Box | None = None) -> Run:
-    """Run a tracker from the first frame of a sequence to its end; from another box than that of its ground truth."""
+    """Run a tracker on a sequence from an initial box, by default the ground truth."""
     box = box or Box(*map(float, sequence.boxes[0]))
     boxes, seconds = np.full((len(sequence), 4), np.nan), np.zeros(len(sequence))
     for row, image in enumerate(sequence.frames()):
         begin = perf_counter()
         if row == 0:
             tracker.init(image, box)
-            found: Box | None = box
+            output: Box | None = box
         else:
-            _, found = tracker.update(image)
+            _, output = tracker.update(image)
         seconds[row] = perf_counter() - begin
-        if found is not None:
-            boxes[row] = found
-    return Run(sequence, boxes.round(4), seconds)  # as precise as the files of the benchmarks' toolkits
+        if output is not None:
+            boxes[row] = output
+    return Run(sequence, boxes.round(4), seconds)  # the precision of the toolkits' files
 
 
 def evaluate(
@@ -76,19 +76,18 @@ def evaluate(
     done: Callable[[Run], None] = lambda _: None,
     failed: Callable[[CatstreamError], None] | None = None,
 ) -> list[Run]:
-    """Run `catstream.Tracker` on sequences, and return the runs in their order.
+    """Run `catstream.Tracker` on sequences, and return the runs in order.
 
     jobs : number of processes, with one thread each
     done : function that is called with each finished run
-    failed : function that is called with the error of each run that fails, while the other runs continue; if None, the
-        error is raised
+    failed : function that is called with the error of each failed run; if None, the error is raised
     """
     names = [sequence.name for sequence in sequences]
     for name in names:
         if names.count(name) > 1:
             raise VideoError(f"duplicate sequence name {name!r}: rename one of the folders")
     runs: dict[str, Run] = {}
-    tasks = [(sequence, settings) for sequence in sorted(sequences, key=len, reverse=True)]  # no long one alone at last
+    tasks = [(sequence, settings) for sequence in sorted(sequences, key=len, reverse=True)]  # longest first
     results = run_tasks(_follow, tasks, jobs) if jobs > 1 else (_follow(*task) for task in tasks)
     with closing(results):  # an error or Ctrl-C kills the workers
         for result in results:
@@ -103,7 +102,7 @@ def evaluate(
 
 
 def _follow(sequence: Sequence, settings: Settings) -> Run | CatstreamError:
-    """Run catstream from the first frame with the object on, in one thread: the jobs are the parallelism."""
+    """Run catstream from the first frame with the object on, in one thread, because jobs run in parallel."""
     sequence = sequence.since(int(sequence.present.argmax()))
     try:
         with one_thread(opencv=True):

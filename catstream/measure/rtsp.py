@@ -1,9 +1,9 @@
-"""H.264 over RTSP, as network cameras send it, for the camera of a load test.
+"""H.264 over RTSP for the camera of a load test, in the format of network cameras.
 
-The video is encoded before the load test, so that a stream takes little processor time from the pipelines. RTP is sent
-in the connection of RTSP (RFC 2326, section 10.12), in packets of RFC 6184. The answer to PLAY states the due time of
-the first frame as its position. FFmpeg counts from there, so the time stamp of each frame is its due time, up to the
-period of the 32 bits of RTP. Other servers of live streams state no position, so the age of a frame would not be known.
+The video is encoded before the load test, so a stream takes little processor time from the pipelines. RTP is
+interleaved with RTSP (RFC 2326, section 10.12), in packets of RFC 6184. The response to PLAY contains the due time of
+the first frame as its position, from which FFmpeg counts. Therefore the time stamp of each frame is its due time,
+modulo the 32 bits of RTP. Real servers send no position, so the age of their frames is unknown.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from typing import Any
 
 _CLOCK = 90_000  # ticks per second of RTP time stamps of video
 _PERIOD = 2**32 / _CLOCK  # seconds
-_PAYLOAD = 1400  # bytes, so that a packet fits into one of Ethernet, as cameras send it
-_FRAGMENT = 28  # type of a packet with a part of a NAL unit (FU-A)
+_PAYLOAD = 1400  # maximum bytes, so that a packet fits into an Ethernet frame
+_FRAGMENT = 28  # type of a packet with a fragment of a NAL unit (FU-A)
 _DESCRIPTION = (
     b"v=0\r\no=- 0 0 IN IP4 127.0.0.1\r\ns=load test\r\nt=0 0\r\nm=video 0 RTP/AVP 96\r\n"
     b"a=rtpmap:96 H264/90000\r\na=fmtp:96 packetization-mode=1\r\na=control:video\r\n"
@@ -28,7 +28,7 @@ _DESCRIPTION = (
 
 
 def due_time(pts: float, arrival: float) -> float:
-    """Return the due time of a frame from its time stamp and the arrival of its track: FFmpeg may shift it by periods.
+    """Return the due time of a frame from its time stamp, which FFmpeg may shift by periods, and its track's arrival.
 
     >>> due_time(pts=1000.0, arrival=1000.1), round(due_time(pts=-1.0, arrival=47721.0), 3)
     (1000.0, 47720.859)
@@ -37,7 +37,7 @@ def due_time(pts: float, arrival: float) -> float:
 
 
 def payloads(unit: bytes) -> Iterator[bytes]:
-    """Yield the RTP payloads of an access unit: its NAL units, the large ones in parts.
+    """Yield the RTP payloads of an access unit: its NAL units, large ones in fragments.
 
     >>> [len(part) for part in payloads(b"\\0\\0\\0\\1" + b"a" * 9 + b"\\0\\0\\1" + b"b" * 1500)]
     [9, 1402, 101]
@@ -53,7 +53,7 @@ def payloads(unit: bytes) -> Iterator[bytes]:
 
 
 class RtspConnection(StreamRequestHandler):
-    """The connection of one receiver: it answers what FFmpeg asks, and then sends frames until the receiver leaves."""
+    """The connection of one receiver: answers FFmpeg's requests, then sends frames until the receiver disconnects."""
 
     disable_nagle_algorithm = True
 
@@ -65,7 +65,7 @@ class RtspConnection(StreamRequestHandler):
                 headers = parse_headers(self.rfile)
                 count = f"CSeq: {headers['CSeq']}\r\nSession: 1\r\n"
                 if method == "PLAY":
-                    # What the receiver reports meanwhile is of no interest, but it must not fill up the connection.
+                    # Read and ignore the receiver's reports, which would fill up the connection.
                     Thread(target=self._read_all, daemon=True).start()
                     self._play(server.frames(int(address.strip("/").split("/")[3])), count)
                     return

@@ -1,16 +1,16 @@
-"""Measures of one-pass evaluation, as the public benchmarks define them.
+"""Measures of one-pass evaluation, by the definitions of the public benchmarks.
 
 They are computed from the boxes of a run and the ground truth, one row for each
-frame, NaN if there is no box:
+frame, NaN without a box:
 
     success plot  share of frames whose overlap exceeds each of 21 thresholds 0, 0.05 ... 1; its mean is the AUC
     success       its value at 0.5
     precision     share of frames whose centre is at most 20 pixels off
-    normalised precision  mean of that share over 51 thresholds 0 ... 0.5, distances as parts of the object's size
+    normalised precision  mean share over 51 thresholds 0 ... 0.5, with distances relative to the object's size
 
-Frames without the object do not count; frames in which the tracker reports no
-box count as missed. The values agree with the got10k toolkit. Whether the tracker
-reports absence when the object is absent, and only then, is counted apart.
+Frames without the object are ignored; frames without a reported box count as
+missed. The values agree with the got10k toolkit. Correct and false reports of
+absence are counted separately.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ _SHARES = np.linspace(0, 0.5, 51)
 class Score:
     """The measures of one run, from 0 to 1, and numbers of frames.
 
-    absent, noticed  frames without the object, and how many of them have no reported box
-    present, false   frames with the object, and how many of them have no reported box
+    absent, noticed  frames without the object, and the number of them without a reported box
+    present, false   frames with the object, and the number of them without a reported box
     """
 
     auc: float
@@ -46,7 +46,7 @@ class Score:
 
 
 def present(boxes: Float64) -> Bool:
-    """Return whether each row has a box, bool (frames,); it has none if a number is NaN."""
+    """Return True for each row with a box, bool (frames,); a row with NaN has no box."""
     return np.asarray(np.isfinite(boxes).all(axis=1))
 
 
@@ -88,16 +88,16 @@ def precision_plot(boxes: Float64, truth: Float64) -> Float64:
 def score(boxes: Float64, truth: Float64) -> Score:
     """Return all measures of one run.
 
-    boxes, truth : float64 (frames, 4), x, y, w, h in pixels, NaN if there is no box
+    boxes, truth : float64 (frames, 4), x, y, w, h in pixels, NaN without a box
     """
     is_present, is_reported = present(truth), present(boxes)
     success = success_plot(boxes, truth)
-    off = distances(boxes, truth, normalised=True)[is_present]
+    errors = distances(boxes, truth, normalised=True)[is_present]
     return Score(
         auc=float(success.mean()),
         success=float(success[10]),
         precision=float(precision_plot(boxes, truth)[20]),
-        normalised_precision=float((off[:, None] <= _SHARES).mean()),
+        normalised_precision=float((errors[:, None] <= _SHARES).mean()),
         absent=int((~is_present).sum()),
         noticed=int((~is_present & ~is_reported).sum()),
         present=int(is_present.sum()),

@@ -1,4 +1,4 @@
-"""The subscribers of a load test: processes that receive the messages of pipelines, and record when they arrive."""
+"""The subscribers of a load test: processes that receive messages of pipelines, and record their arrival times."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ from catstream.wire.channels import PUBLIC
 from catstream.wire.messages import End, Features, Track
 from catstream.wire.newest import GapCounter, Subscriber
 
-_PER_PROCESS = 100  # one process with 500 subscribers receives their messages later than five with 100
-_SLOW_SECONDS = 0.5  # between two messages of a slow subscriber
+_PER_PROCESS = 100  # more subscribers in one process would receive their messages later
+_SLOW_SECONDS = 0.5  # interval between two messages of a slow subscriber
 _DRAIN_SECONDS = 20.0  # timeout for fast subscribers to receive the last messages
 
 
 class Subscribers:
     """The subscribers to one channel of a stream; a context manager.
 
-    Fast ones wait for a message as a program does; slow ones read two messages per second.
+    Fast subscribers read each message at once; slow ones read two messages per second.
     """
 
     def __init__(self, plan: Plan, stream: int, channel: str, address: Address) -> None:
@@ -62,13 +62,13 @@ class Subscribers:
         numbers = {track.frame: schedule.number(track.pts or 0.0) for _, track in observations.tracks}
         deadline = monotonic() + _DRAIN_SECONDS * (End in PUBLIC[self._channel].messages)
         for pipe in self._fast:
-            pipe.recv()  # it is connected
+            pipe.recv()  # reports that all are connected
             if not pipe.poll(max(0.0, deadline - monotonic())):
-                pipe.send(None)  # the channel has no end, or it was lost
+                pipe.send(None)  # the channel has no `End`, or it was lost
             if not pipe.poll(_DRAIN_SECONDS):
                 raise ServiceError("a process of the subscribers has exited: its error is printed above")
             for receipts, gaps in pipe.recv():
-                # A restarted detector reuses numbers: what arrived before its frame was due is about another frame.
+                # A restarted detector reuses numbers: messages before the due time are about an earlier frame.
                 arrivals = [(moment, numbers.get(frame, -1)) for frame, moment in zip(*receipts, strict=True)]
                 answers = [(moment, number) for moment, number in arrivals if moment >= schedule.due(number)]
                 latency.append(latencies_to_answer(times, answers, end).astype(np.float32))
@@ -89,9 +89,9 @@ class Subscribers:
 
 
 def _receive(count: int, is_slow: bool, channel: str, address: Address, pipe: Connection, parent: int) -> None:
-    """Run some of the subscribers until the pipeline ends or the load test asks for their receipts; send these.
+    """Run `count` subscribers until the pipeline ends or the load test requests their receipts, and send these.
 
-    A receipt of each frame has its number and time. The messages about all objects in a frame have the same number.
+    The receipts are the number and the arrival time of each frame. All messages about a frame have its number.
     """
     die_with(parent)
     receipts, gaps = [(array("l"), array("d")) for _ in range(count)], [GapCounter() for _ in range(count)]
@@ -103,7 +103,7 @@ def _receive(count: int, is_slow: bool, channel: str, address: Address, pipe: Co
         subscribers = [*selector.get_map().values()]
         selector.register(pipe, EVENT_READ)
         while running and not pipe.poll():
-            # Step 1: wait for messages. A slow subscriber reads one message, which need not be new, in each pause.
+            # Step 1: wait for messages. A slow subscriber reads one message after each pause.
             if is_slow:
                 sleep(_SLOW_SECONDS)
             for key in subscribers if is_slow else [key for key, _ in selector.select() if key.data]:

@@ -11,15 +11,15 @@ from catstream.measure.latency import REST, percentiles
 from catstream.measure.load_result import Result
 
 _MOST_INTERVALS = 3600
-_ROUNDING = 1e-6  # seconds by which a frame may be due before the interval that it belongs to
+_ROUNDING = 1e-6  # tolerance in seconds for the due time of a frame at the begin of its interval
 
 
 def timeline(result: Result) -> dict[str, list[float]]:
-    """Return the figures of each second, of all streams together.
+    """Return the figures of each second over all streams.
 
-    The intervals are longer in a run of more than an hour, or below one frame per second, so that each has a frame.
+    Intervals are longer in a run of more than an hour, or below one frame per second, because each needs a frame.
 
-    seconds            begin of each interval, from the due time of the first frame on
+    seconds            start of each interval, relative to the due time of the first frame
     p50, p95, p99      seconds from the frames that are due in the interval to their tracks
     tracks-p50 ...     seconds to their receipt by fast subscribers, for each channel
     skipped            share of the frames
@@ -27,7 +27,7 @@ def timeline(result: Result) -> dict[str, list[float]]:
     cores              mean number of busy cores, by the pipelines
     load_cores         ... by the camera, the subscribers and the load test
     other_cores        ... by other processes of the machine
-    memory             bytes of the pipelines (PSS), which is read every five seconds
+    memory             bytes of the pipelines (PSS), read every five seconds
     """
     rate, streams, readings = result.plan.rate, result.streams, result.readings
     start = min(stream.due[0] for stream in streams)
@@ -36,7 +36,7 @@ def timeline(result: Result) -> dict[str, list[float]]:
     seconds = np.arange(0, duration + _ROUNDING, interval)
 
     def by_interval(measured: Iterable[tuple[np.ndarray, np.ndarray]]) -> list[np.ndarray]:
-        """All values of each interval, from arrays of due times and of values, with the frames along the last axis."""
+        """Split arrays of values by their due times, with the frames along the last axis, into intervals."""
         ends = start + seconds[1:] - _ROUNDING
         parts = [np.split(values, np.searchsorted(due, ends), axis=-1) for due, values in measured]
         return [np.concatenate([part.ravel() for part in of_streams]) for of_streams in zip(*parts, strict=True)]

@@ -1,4 +1,4 @@
-"""`catstream.annotate`: tracks between boxes that a person has drawn at keyframes of a video."""
+"""`catstream.annotate`: tracks objects between boxes that a person has drawn at keyframes of a video."""
 
 from __future__ import annotations
 
@@ -35,11 +35,11 @@ from catstream.video.video_frames import VideoFrames
 from catstream.wire import storage
 from catstream.wire.messages import Check
 
-#: Called during the work with its name, the number of finished frames, and of all; None if that is unknown.
+#: Called with the name of an activity, the number of finished frames, and the total number; None if it is unknown.
 Progress = Callable[[str, int, int | None], object]
 
-#: The boxes of objects by frame, None where the object is absent, "hidden" where too much of it is covered to draw a
-#: box: of one object without a name, or by name.
+#: Boxes by frame, None where the object is absent, "hidden" where it is too occluded for a box: of one object without a
+#: name, or by name.
 _BoxesByFrame = Mapping[int, str | Iterable[float] | None]
 KeyframeBoxes = _BoxesByFrame | Mapping[str, _BoxesByFrame]
 
@@ -47,7 +47,7 @@ KeyframeBoxes = _BoxesByFrame | Mapping[str, _BoxesByFrame]
 class NextFrame(NamedTuple):
     """The frame to annotate next, and the object.
 
-    errors  expected number of wrong frames in the stretch that the frame divides
+    errors  expected number of wrong frames in its stretch
     """
 
     frame: int
@@ -57,9 +57,9 @@ class NextFrame(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Task:
-    """A pass to be tracked, and the boxes that it begins with: that at `start`; with a memory, all of the object."""
+    """A pass to be tracked, with the box at `start` or, with a memory, all boxes of the object."""
 
-    object: str = field(compare=False)  # the pass depends on the boxes only
+    object: str = field(compare=False)  # the pass depends only on the boxes
     start: int
     stop: int
     keyframes: tuple[tuple[int, Box | None], ...]
@@ -82,19 +82,19 @@ class Annotation:
     """The keyframes of the objects of a video, and the tracks between them.
 
     Call `track` after the constructor, which only opens the video; `annotate` does both. Each stretch between two
-    keyframes is tracked from both ends. If that does not check all of its frames, it is tracked from both ends again,
-    with the merged model of all other boxes of the object. `add` tracks only beside its box; earlier passes are still
-    used as far as they agree with the boxes. No pass begins or ends in a frame where the object is hidden. Close the
-    annotation, or use it in a `with`: until then, its processes run. Frames are decoded from the video when needed.
+    keyframes is tracked from both ends. If frames remain unchecked, it is tracked from both ends again, with the merged
+    model of all other boxes of the object. `add` tracks only the stretches next to its box; earlier passes are used as
+    far as they agree with the boxes. A pass does not begin or end in a frame where the object is hidden.
+    Close the annotation, or use it in a `with`, to end its processes. Frames are decoded from the video when needed.
 
     Parameters
     ----------
     video : path of a file or a folder of images
     boxes : mapping of frame to box, or of object to such a mapping
-        Frames count from 0; a box is None where the object is absent, "hidden" where it is covered.
+        Frames count from 0; a box is None where the object is absent, "hidden" where it is occluded.
     settings : Settings or mapping of str
         The settings that differ from the defaults.
-    part : slice of the frames of the video, whose frames count from 0; by default all
+    part : slice of the frames of the video, which are then renumbered from 0; by default all
     jobs : number of processes; None for the number of cores
     progress : function that is called during the work, see `Progress`
 
@@ -102,17 +102,17 @@ class Annotation:
     ----------
     frames : VideoFrames
     keyframes : dict of the boxes of each object, by name and frame
-    stored : file of finished passes, see `save_passes`; `scan` reads it. None without one
-    progress : as of the parameters
+    stored : file of finished passes, see `save_passes`, which `scan` reads; None to store nothing
+    progress : see the parameters
 
     Raises
     ------
     VideoError
-        If the video is live or cannot be read; from `track` also if a frame cannot be decoded.
+        If the video is live or cannot be read; by `track` also if a frame cannot be decoded.
     BoxError
-        For a box outside its frame; from `scan` and `track` also for a frame beyond the end of the video.
+        For a box outside its frame; by `scan` and `track` also for a frame beyond the end of the video.
     ObjectError
-        For a name that is not valid, an object without a box, or too many.
+        For an invalid name, an object without a box, or too many objects.
     """
 
     def __init__(
@@ -131,8 +131,8 @@ class Annotation:
         if is_live(os.fspath(video)):
             redacted = without_password(os.fspath(video))
             raise VideoError(f"cannot annotate a live source ({redacted}): record it to a file first")
-        self._passes: dict[Task, Pass | None] = {}  # None if it cannot start
-        self._fusions: dict[_Stretch, tuple[Float64, Float64, Float64]] = {}  # what is known of them, fused
+        self._passes: dict[Task, Pass | None] = {}  # None if a pass cannot start
+        self._fusions: dict[_Stretch, tuple[Float64, Float64, Float64]] = {}  # cached results of `fuse`
         self._workers = Workers(self._jobs)
         self._folder = tempfile.TemporaryDirectory(prefix="catstream-annotate-", ignore_cleanup_errors=True)
         try:
@@ -154,19 +154,19 @@ class Annotation:
         return f"<catstream.Annotation of {self.frames.name}: {count} boxes, {self.share_checked:.0%} checked>"
 
     def stop(self) -> None:
-        """End the processes and close the video, until a method needs them again."""
+        """End the processes and close the video; methods that need them start and open them again."""
         self._workers.kill()
         self.frames.close()
 
     def close(self) -> None:
-        """End the processes and close the video; `add` and `track` cannot be called any more."""
+        """End the processes and close the video; `add` and `track` can no longer be called."""
         self.stop()
         self._folder.cleanup()
 
     def add(self, frame: int, box: str | Iterable[float] | None, object: str = UNNAMED) -> None:
-        """Add or replace the box of an object at a frame, and track what depends on it; None or "hidden" as of `boxes`.
+        """Add or replace the box of an object at a frame, and track the stretches next to it.
 
-        BoxError or ObjectError as of the constructor.
+        The box and the errors are as in the constructor.
         """
         name = check_name(object)
         drawn: _BoxesByFrame = {**self.keyframes.get(name, {}), frame: box}
@@ -174,7 +174,7 @@ class Annotation:
         self.track()
 
     def set_boxes(self, boxes: KeyframeBoxes) -> None:
-        """Replace the boxes of all objects, without tracking. BoxError or ObjectError as of the constructor."""
+        """Replace the boxes of all objects, without tracking; the errors are as in the constructor."""
         parsed = _parsed(boxes)
         check_count(len(parsed), self.settings.run.max_objects)
         self._check(parsed)
@@ -187,9 +187,9 @@ class Annotation:
         }
 
     def scan(self, *, exact: bool = False) -> None:
-        """Number the frames, if they are not yet; `exact` as of `VideoFrames.scan`.
+        """Number the frames, unless this was done; `exact` is as in `VideoFrames.scan`.
 
-        VideoError if a frame cannot be decoded: those before it are numbered, and `track` uses them.
+        VideoError if a frame cannot be decoded: `track` uses the frames before it.
         """
         if exact or not self._is_scanned:
             self._is_scanned = True
@@ -199,13 +199,13 @@ class Annotation:
             try:
                 self.frames.scan(lambda *done: self.progress("reading", *done), exact=exact)
             except BaseException as error:
-                self._is_scanned = isinstance(error, VideoError)  # if not, it was interrupted by `progress`
+                self._is_scanned = isinstance(error, VideoError)  # otherwise `progress` has interrupted it
                 raise
             self._load_passes()
         self._check(self.keyframes)
 
     def track(self) -> None:
-        """Run the passes that are missing. If it is interrupted, the finished passes remain."""
+        """Run the missing passes. After an interruption, the finished passes remain."""
         self.scan()
         while tasks := self.missing():
             total, finished = sum(task.frames for task in tasks), 0
@@ -213,8 +213,8 @@ class Annotation:
             results = self._workers.run(_work, work) if self._jobs > 1 else (_work(*task) for task in work)
             try:
                 with closing(results):
-                    for task, one in results:
-                        self._insert(task, one)
+                    for task, result in results:
+                        self._insert(task, result)
                         finished += task.frames
                         self.progress("tracking again" if task.use_memory else "tracking", finished, total)
             except VideoError:
@@ -223,10 +223,10 @@ class Annotation:
                 self.scan(exact=True)
 
     def missing(self) -> list[Task]:
-        """The passes that are missing, longest first: of each stretch those without a memory, then those with one.
+        """The missing passes, longest first: for each stretch passes without a memory, then passes with one.
 
-        A pass without a memory is not missing if a longer one starts at the same keyframe: it has the same boxes. Those
-        with a memory are missing if the frames are not checked, and there are other boxes of the object.
+        A pass without a memory is not missing if a longer one from the same keyframe contains it. Passes with a memory
+        are missing if there are unchecked frames, and other boxes of the object.
         """
         tasks: list[Task] = []
         for stretch in self._stretches():
@@ -237,9 +237,9 @@ class Annotation:
         return sorted(tasks, key=lambda task: -task.frames)
 
     def submit(self, task: Task) -> tuple[Future[tuple[Task, Pass | None]], Path]:
-        """Run a missing pass in one of the processes; `store` takes it.
+        """Run a missing pass in one of the processes; `store` receives the future.
 
-        The size of the file is the number of frames that are tracked. If the file is deleted, the pass is stopped.
+        The size of the file is the number of tracked frames. Deleting the file stops the pass.
         """
         file, count = tempfile.mkstemp(dir=self._folder.name)
         os.close(file)
@@ -248,23 +248,23 @@ class Annotation:
 
     @contextmanager
     def paused(self) -> Iterator[None]:
-        """Pause the submitted passes inside a `with`, each after its present frame: the processor is free sooner."""
+        """Pause the submitted passes inside a `with`, to free the processor; each pauses after its current frame."""
         file = Path(self._folder.name, PAUSED)
         file.touch()
         try:
             yield
         finally:
-            file.unlink(missing_ok=True)  # several threads may pause them
+            file.unlink(missing_ok=True)  # several threads may pause passes
 
     def store(self, future: Future[tuple[Task, Pass | None]]) -> None:
-        """Store a pass that was submitted; it is used as long as the boxes that it began with are there.
+        """Store a submitted pass, which is used as long as its boxes exist.
 
         VideoError if a frame could not be decoded.
         """
         self._insert(*self._workers.result(future))
 
     def save_passes(self) -> None:
-        """Write the passes of the present boxes to the file `stored`; VideoError if it cannot be written."""
+        """Write the passes of existing boxes to the file `stored`; VideoError if it cannot be written."""
         if self.stored is not None:
             boxes = [drawn.items() for drawn in self._drawn.values()]
             tasks = [task for task in self._passes if any(set(task.keyframes) <= drawn for drawn in boxes)]
@@ -279,7 +279,7 @@ class Annotation:
                 storage.write(self.stored, arrays, facts, durable=False)
 
     def _load_passes(self) -> None:
-        """Read the file `stored`. It is ignored if it is damaged, or of other frames, settings or another version."""
+        """Read the file `stored`, unless it is damaged, or from other frames, settings or another version."""
         with suppress(OSError, ProtocolError):
             arrays, facts = storage.read(self.stored or os.devnull)
             tasks = msgspec.convert(facts["tasks"], list[Task]) if facts["origin"] == self._origin() else []
@@ -289,13 +289,13 @@ class Annotation:
 
     def _origin(self) -> list[object]:
         """The inputs of the passes except the boxes; stored passes are used only if they are equal."""
-        stats = [file.stat() for file in self.frames.images or [self._video] if file.exists()]  # it may be a pattern
+        stats = [file.stat() for file in self.frames.images or [self._video] if file.exists()]  # or a pattern
         files = [[stat.st_size, stat.st_mtime_ns] for stat in stats]
         return [version("catstream"), self.settings.changed(), repr(self._part), len(self.frames), files]
 
     @property
     def tracks(self) -> dict[str, ObjectTracks]:
-        """The track of each object in all frames, by name, with `checked` and `probability`; doubtful if unchecked."""
+        """The track of each object in all frames, by name, with `checked` and `probability`."""
         return {name: self._tracks(name) for name in self.keyframes}
 
     @property
@@ -305,27 +305,24 @@ class Annotation:
 
     @property
     def share_checked(self) -> float:
-        """Share of frames that are not unchecked, over all objects, from 0 to 1."""
+        """Share of frames over all objects that are not unchecked, from 0 to 1."""
         unchecked = [tracks.unchecked for tracks in self.tracks.values()]
         return 1 - float(np.mean(unchecked)) if unchecked else 0.0
 
     def passes(self, name: str = UNNAMED) -> list[Pass]:
         """The finished passes of an object, in the order of their keyframes: the proposals for its unchecked frames."""
         drawn = self._drawn.get(name, {}).items()
-        passes = [one for task, one in self._passes.items() if one is not None and set(task.keyframes) <= drawn]
-        return sorted(passes, key=lambda one: (one.start, one.stop, one.with_memory))
+        passes = [item for task, item in self._passes.items() if item is not None and set(task.keyframes) <= drawn]
+        return sorted(passes, key=lambda item: (item.start, item.stop, item.with_memory))
 
     def proposals(self, name: str, frame: int) -> dict[bool, Box | None]:
-        """The box of the best pass at a frame that is not a keyframe, for each direction: True is forwards.
-
-        The best one has the highest score there. A direction without a pass is left out.
-        """
+        """The box of the pass with the highest score at a frame, for each direction with a pass: True is forwards."""
         boxes: dict[bool, Box | None] = {}
         for stretch in self._stretches():
             if stretch.object == name and stretch.start <= frame < stretch.stop:
                 candidates = [(part, abs(frame - part.start) - 1) for part in self._parts(stretch)]
-                for part, place in sorted(candidates, key=lambda one: one[0].scores[one[1]]):  # the best one last
-                    boxes[part.is_forward] = box_of(part.boxes[place])
+                for part, row in sorted(candidates, key=lambda item: item[0].scores[item[1]]):  # best last
+                    boxes[part.is_forward] = box_of(part.boxes[row])
         return boxes
 
     def next_frame(self) -> NextFrame | None:
@@ -333,16 +330,16 @@ class Annotation:
         return next(iter(self.next_frames()), None)
 
     def next_frames(self) -> list[NextFrame]:
-        """A frame to annotate in each stretch that is not checked, in the order of their expected errors.
+        """A frame to annotate in each unchecked stretch, most expected errors first.
 
-        It divides the expected errors of its stretch into halves, or those on the side of the hidden frames where most
-        are; at an end of the video without a keyframe, it is the first or the last frame.
+        The frame halves the expected errors of its stretch or, with hidden frames, of the part between them with the
+        most errors. At an end of the video without a keyframe, it is the first or the last frame.
         """
         unchecked = (stretch for stretch in self._stretches() if not self._is_checked(stretch))
         return sorted(map(self._next_in, unchecked), key=lambda frame: -frame.errors)
 
     def _check(self, keyframes: Mapping[str, Mapping[int, KeyframeBox]]) -> None:
-        """Raise BoxError if a box is not in its frame, or a keyframe not in the video, as soon as that is known."""
+        """Raise BoxError if a box is outside its frame or, once the video is scanned, a keyframe outside the video."""
         for name, drawn in keyframes.items():
             for frame, box in drawn.items():
                 with errors_about(name):
@@ -354,27 +351,27 @@ class Annotation:
                         box.validated(*self.frames.size)
 
     def _stretches(self) -> Iterator[_Stretch]:
-        """Yield the stretches of all objects that have a frame."""
+        """Yield the non-empty stretches of all objects."""
         for name, drawn in self._drawn.items():
             ends = [-1, *sorted(drawn), len(self.frames)]
             for before, after in pairwise(ends):
                 if after - before > 1:
                     yield _Stretch(name, before + 1, after)
 
-    def _ways(self, stretch: _Stretch) -> list[tuple[int, int]]:
-        """Start and stop of the passes of a stretch: one from each of its ends that is a keyframe."""
+    def _routes(self, stretch: _Stretch) -> list[tuple[int, int]]:
+        """Start and stop of the passes of a stretch: one from each end that is a keyframe."""
         drawn, before, after = self._drawn[stretch.object], stretch.start - 1, stretch.stop
-        ways = [(before, min(after, len(self.frames) - 1)), (after, max(before, 0))]
-        return [way for way in ways if way[0] in drawn]
+        routes = [(before, min(after, len(self.frames) - 1)), (after, max(before, 0))]
+        return [route for route in routes if route[0] in drawn]
 
     def _missing_of(self, stretch: _Stretch, *, use_memory: bool) -> list[Task]:
         name, drawn = stretch.object, self._drawn[stretch.object]
         tasks = []
-        for start, stop in self._ways(stretch):
+        for start, stop in self._routes(stretch):
             boxes = tuple(sorted(drawn.items())) if use_memory else ((start, drawn[start]),)
             task = Task(name, start, stop, boxes, use_memory)
-            same = (one for one in self.passes(name) if one.start == start and one.with_memory == use_memory)
-            done = any(one.stop == stop or (one.covers(start, stop) and not use_memory) for one in same)
+            same = (item for item in self.passes(name) if item.start == start and item.with_memory == use_memory)
+            done = any(item.stop == stop or (item.covers(start, stop) and not use_memory) for item in same)
             if not done and task not in self._passes and (use_memory or drawn[start] is not None):
                 tasks.append(task)
         return tasks
@@ -391,9 +388,9 @@ class Annotation:
         return ObjectTracks(name, self.keyframes[name], self.frames.times, boxes, probabilities, scores)
 
     def _parts(self, stretch: _Stretch) -> list[Pass]:
-        """The parts of the finished passes that run over a stretch."""
+        """The parts of the finished passes in a stretch."""
         drawn = self._drawn[stretch.object]
-        parts = (one.part(*way, drawn) for way in self._ways(stretch) for one in self.passes(stretch.object))
+        parts = (item.part(*route, drawn) for route in self._routes(stretch) for item in self.passes(stretch.object))
         return [part for part in parts if part is not None]
 
     def _fused(self, stretch: _Stretch) -> tuple[Float64, Float64, Float64]:
@@ -402,15 +399,15 @@ class Annotation:
             self._fusions[stretch] = fused
         return self._fusions[stretch]
 
-    def _insert(self, task: Task, one: Pass | None) -> None:
-        self._passes[task] = one
+    def _insert(self, task: Task, result: Pass | None) -> None:
+        self._passes[task] = result
         first, last = sorted((task.start, task.stop))
         for stretch in [*self._fusions]:
             if stretch.start <= last and first < stretch.stop:
                 del self._fusions[stretch]
 
     def _hidden(self, stretch: _Stretch) -> list[int]:
-        """The frames of a stretch in which the object is hidden, counted from its start."""
+        """The frames of a stretch where the object is hidden, relative to its start."""
         hidden = self.keyframes[stretch.object].keys() - self._drawn[stretch.object].keys()
         return sorted(frame - stretch.start for frame in hidden if stretch.start <= frame < stretch.stop)
 
@@ -447,8 +444,8 @@ def annotate(
     """Track objects between boxes at keyframes of a video, and check the tracks.
 
     Each stretch between two boxes is tracked from both ends. A frame is checked if the passes agree so well that its
-    box is right with a probability of 97 %, see `catstream.offline.fusion`. See `Annotation` for the parameters
-    and errors.
+    box is correct with a probability of 97 %, see `catstream.offline.fusion`. See `Annotation` for the parameters and
+    errors.
     """
     if not boxes:
         raise ObjectError("no object: pass the box of one in at least one frame")
@@ -464,15 +461,15 @@ def annotate(
 def _work(
     task: Task, frames: VideoFrames, settings: Settings, models: Path, count: Path | None = None
 ) -> tuple[Task, Pass | None]:
-    way = task.start, task.stop, dict(task.keyframes)
+    route = task.start, task.stop, dict(task.keyframes)
     try:
-        return task, run_pass(frames, *way, settings, models, use_memory=task.use_memory, count=count)
+        return task, run_pass(frames, *route, settings, models, use_memory=task.use_memory, count=count)
     finally:
         frames.close()
 
 
 def _parsed(boxes: KeyframeBoxes) -> dict[str, dict[int, KeyframeBox]]:
-    """The boxes by object and frame; ObjectError if an object has no box, or a name is not valid."""
+    """The boxes by object and frame; ObjectError if an object has no box, or a name is invalid."""
     if all(isinstance(value, Mapping) for value in boxes.values()):
         by_name = cast(Mapping[str, _BoxesByFrame], boxes)
     else:

@@ -1,4 +1,4 @@
-"""The search of files for the objects of saved models: frames in equal distances of time, and what is seen in them."""
+"""The search of files for the objects of saved models, in frames at regular intervals."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ from catstream.offline.find_files import File, NamedFrame, find_files
 from catstream.offline.find_scan import THRESHOLD, Match, Scan
 from catstream.video.frames import Frame
 
-#: Seconds of a video between two frames that are searched.
+#: Interval between two searched frames of a video, in seconds.
 EVERY = 0.2
 
 
 @dataclass(frozen=True, slots=True)
 class Detection:
-    """An object that was detected in a frame.
+    """A detection of an object in a frame.
 
     object  name of the object
     file    path of the video, the image, or the folder of images
-    frame   number of the frame, or of the image in its folder; the first one is 0
+    frame   number of the frame, or of the image in its folder, from 0
     time    seconds since the start of the video
     box     box of the object in pixels of the frame
     score   about 1 on the object, near 0 elsewhere; at least the threshold of the search
@@ -47,11 +47,11 @@ class Detection:
 
 @dataclass(slots=True)
 class Search:
-    """Searches files for the objects of several models, in as many threads as there are cores.
+    """Searches files for the objects of several models, with a thread for each core.
 
-    models     name of each object -> its model
+    models     models by the name of the object
     threshold  minimum score of a detection
-    every      seconds of a video between two frames that are searched, 0 for every frame
+    every      interval between two searched frames of a video in seconds, 0 for every frame
     """
 
     models: Mapping[str, SavedModel]
@@ -69,13 +69,13 @@ class Search:
         return hashlib.sha256(repr((models, self.threshold, self.every)).encode()).hexdigest()[:16]
 
     def file(self, file: File, problems: list[str]) -> Iterator[tuple[Frame, list[Detection]]]:
-        """Yield each searched frame of a file with its detections. See `File.frames` for the problems and errors."""
+        """Yield each searched frame of a file with its detections; problems and errors are as in `File.frames`."""
         frames = file.frames(self.every, problems)
         with closing(frames), closing(_scanned(self._scan, frames)) as scanned:
             for (frame, image), results in scanned:
-                place = str(file.path), frame.number, frame.time
+                position = str(file.path), frame.number, frame.time
                 detections = [
-                    Detection(name, *place, match.box, match.score, image)
+                    Detection(name, *position, match.box, match.score, image)
                     for name, matches in zip(self.models, results, strict=True)
                     for match in matches
                 ]
@@ -94,13 +94,13 @@ def find(
     Parameters
     ----------
     models : path or SavedModel, or iterable of them
-        An object without a name gets that of its file.
+        An object without a name is named after its file.
     paths : path, or iterable of paths
         Videos, images, and folders, which are searched with their subfolders.
     threshold : float
         Minimum score of a detection; the score is about 1 on the object.
     every : float
-        Seconds of a video between two frames that are searched, 0 for every frame.
+        Interval between two searched frames of a video in seconds, 0 for every frame.
 
     Yields
     ------
@@ -110,9 +110,9 @@ def find(
     Raises
     ------
     ServiceError, ProtocolError
-        If a model does not exist, or is damaged or of other features.
+        If a model does not exist, is damaged, or has other features.
     SettingsError
-        If two models have one name.
+        If two models have the same name.
     VideoError
         If a path does not exist or has nothing to search; after all files, if one was damaged.
 
@@ -127,7 +127,7 @@ def find(
 
 
 def load_models(models: Iterable[str | os.PathLike[str] | SavedModel]) -> dict[str, SavedModel]:
-    """Load models; return each by the name of its object, or of its file."""
+    """Load models; returns them by the name of their object or file."""
     named: dict[str, SavedModel] = {}
     for number, model in enumerate(models, 1):
         saved = model if isinstance(model, SavedModel) else SavedModel.load(model)
@@ -153,7 +153,7 @@ def _detections(search: Search, files: list[File]) -> Iterator[Detection]:
 
 
 def _scanned(scan: Scan, frames: Iterator[NamedFrame]) -> Generator[tuple[NamedFrame, list[list[Match]]]]:
-    """Scan frames in several threads, and yield the results in order; an error of the source comes after them."""
+    """Scan frames in several threads, and yield the results in order; an error of the source is raised at the end."""
     workers = cores()
     pending: deque[tuple[NamedFrame, Future[list[list[Match]]]]] = deque()
     problem: VideoError | None = None

@@ -1,4 +1,4 @@
-"""The files that a search reads: videos, images and folders of images, each once."""
+"""Collects and reads the files of a search: videos, images and folders of images."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from catstream.video.frames import Frame, read_ahead
 from catstream.video.images import IMAGES, ImageReader, first_pages, natural_order, pages_of
 from catstream.video.source import VIDEOS, open_source
 
-#: A frame that is searched, and the name of its file in a folder of images.
+#: A frame, and the name of its file in a folder of images.
 NamedFrame = tuple[Frame, str]
 
 _READING = RunSettings(skip_damaged=True)
-_TIME_STEP = 0.001  # of most containers, in seconds: time stamps are rounded to it
+_TIME_STEP = 0.001  # resolution of the time stamps in most containers, in seconds
 
 _log = logging.getLogger(__name__)
 
@@ -31,18 +31,18 @@ _log = logging.getLogger(__name__)
 class File:
     """A video, a folder of images, or a single image.
 
-    path   of the file, or of the folder
-    pages  each image in order, and the number of its page; empty for a video
+    path   path of the file or folder
+    pages  file and page number of each image, in order; empty for a video
     """
 
     path: Path
     pages: tuple[tuple[Path, int], ...] = ()
 
     def frames(self, every: float, problems: list[str]) -> Generator[NamedFrame]:
-        """Yield the frames to search: all images; of a video the first one in each `every` seconds.
+        """Yield the frames to search: all images, or the first frame of a video in each `every` seconds.
 
-        Damaged images and damaged parts of a video are skipped, and added to `problems`. A video that cannot be opened
-        raises VideoError.
+        Damaged images and damaged parts of a video are skipped, and added to `problems`. VideoError if a video cannot
+        be opened.
         """
         return self._of_images(problems) if self.pages else self._of_video(every, problems)
 
@@ -51,9 +51,9 @@ class File:
             interval = -1.0
             with closing(read_ahead(source)) as frames:
                 for frame in frames:
-                    # By time, not by number: the rate of a file may be nominal, and its frames need not be regular.
-                    before, interval = interval, (frame.time + _TIME_STEP) // every if every else frame.number
-                    if interval != before:
+                    # By time, because the frame rate of a file may be wrong or variable.
+                    previous, interval = interval, (frame.time + _TIME_STEP) // every if every else frame.number
+                    if interval != previous:
                         yield frame, ""
             if scaled := source.counters.get("scaled"):
                 _log.warning("%s: %s of another size, scaled to the first", self.path, counted(scaled, "frame"))
@@ -67,7 +67,7 @@ class File:
         for number, (path, _) in enumerate(self.pages):
             image = read_image(number)
             if image is None:
-                problems.append(f"cannot read the image {str(path)!r}: it is left out")
+                problems.append(f"cannot read the image {str(path)!r}: it is skipped")
             else:
                 yield Frame(number, number / _READING.image_rate, image), "" if path == self.path else path.name
 
@@ -75,8 +75,8 @@ class File:
 def find_files(paths: Iterable[str | os.PathLike[str]]) -> list[File]:
     """Return the files to search, in order; folders are searched with their subfolders, except hidden ones.
 
-    Each file and folder is searched once, even if links lead to it. The images of one folder are one file, in natural
-    order (2.png before 10.png). Files of other kinds are counted in the log.
+    Each file and folder is searched once, even if links refer to it. The images of a folder are one file, in natural
+    order (2.png before 10.png). Files of other types are counted in the log.
     """
     visited: set[Path] = set()
     skipped: Counter[str] = Counter()
@@ -90,7 +90,7 @@ def find_files(paths: Iterable[str | os.PathLike[str]]) -> list[File]:
         try:
             entries = sorted((entry for entry in folder.iterdir() if entry.name[0] != "."), key=natural_order)
         except PermissionError:
-            yield File(folder)  # an error when it is read
+            yield File(folder)  # reading it will raise the error
             return
         if images := [entry for entry in entries if _is_image(entry) and is_new(entry)]:
             yield File(folder, tuple(first_pages(images)))
@@ -113,7 +113,7 @@ def find_files(paths: Iterable[str | os.PathLike[str]]) -> list[File]:
     kinds = ", ".join(f"{number} {suffix}" for suffix, number in skipped.most_common())
     if not files:
         raise VideoError(
-            f"the folders hold neither images nor videos{kinds and f' ({kinds})'}: pass other folders, or name a file"
+            f"the folders contain no images or videos{kinds and f' ({kinds})'}: pass other folders, or name a file"
         )
     if skipped:
         _log.warning("not searched: %s (name a file to search it)", kinds)

@@ -21,15 +21,15 @@ from catstream.output.report import COLOURS, write_page
 from catstream.video.drawing import outline
 from catstream.video.frames import Frame, jpeg
 
-_GAP_SECONDS, _GAP_STEPS = 1.0, 2.5  # longest time between two detections of an interval: the longer one of these
+_GAP_SECONDS, _GAP_STEPS = 1.0, 2.5  # maximum time between two detections of an interval: the longer of these
 _PICTURE = 240  # side of a picture in pixels
 _SURROUNDINGS = 1.7  # side of a picture, as a multiple of the longer side of the object's box
-_PICTURES = 200  # of each object, at most
+_PICTURES = 200  # maximum number of pictures of each object
 
 
 @dataclass(slots=True)
 class Interval:
-    """Consecutive detections of one object in a file, the best of them, and a JPEG of it."""
+    """Consecutive detections of one object in a file, the best detection, and its JPEG."""
 
     detections: list[Detection]
     best: Detection
@@ -48,9 +48,9 @@ class FileResult:
     file       path of the video, the image or the folder
     search     digest of the models and options: see `Search.digest`
     pages      number of its images, 0 for a video
-    gap        longest time between two detections of an interval, in seconds
-    problems   reasons for what could not be read
-    intervals  of all objects, in the order of their first detection
+    gap        maximum time between two detections of an interval, in seconds
+    problems   errors of damaged or missing parts
+    intervals  intervals of all objects, in the order of their first detection
     """
 
     file: str
@@ -67,8 +67,8 @@ class FileResult:
     def add(self, frame: Frame, detections: Iterable[Detection]) -> None:
         """Add the detections in a frame.
 
-        A detection continues the interval of its object if that ended a short time ago, wherever in the frame it is: a
-        model is of one object, so its intervals never overlap.
+        A detection continues the interval of its object after a short gap, at any position in the frame: a model is of
+        one object, so its intervals never overlap.
         """
         for detection in detections:
             own = (interval for interval in reversed(self.intervals) if interval.best.object == detection.object)
@@ -83,7 +83,7 @@ class FileResult:
 
 
 def _picture(image: np.ndarray, box: Box) -> bytes:
-    """A small square JPEG of an object with its box and some of its surroundings."""
+    """A small square JPEG of an object with its box and its surroundings."""
     height, width = image.shape[:2]
     side = round(np.clip(max(box.w, box.h) * _SURROUNDINGS, 16, min(width, height)))
     left, top = (round(centre - side / 2) for centre in box.centre)
@@ -94,9 +94,9 @@ def _picture(image: np.ndarray, box: Box) -> bytes:
 
 
 class SearchResults(AbstractContextManager["SearchResults"]):
-    """The results in a folder: results.ndjson has a line for each file that was searched. Use it in a `with`.
+    """The results in a folder: results.ndjson has a line for each searched file. Use it in a `with`.
 
-    files  the results by the path of the file
+    files  results by the path of the file
     """
 
     def __init__(self, folder: Path, search: str, *, overwrite: bool = False) -> None:
@@ -104,7 +104,7 @@ class SearchResults(AbstractContextManager["SearchResults"]):
         with writing(folder):
             folder.mkdir(parents=True, exist_ok=True)
             data = b"" if overwrite or not self._path.exists() else self._path.read_bytes()
-        whole = data.rfind(b"\n") + 1  # the last line of a process that was killed may be incomplete
+        whole = data.rfind(b"\n") + 1  # a killed process may have left an incomplete last line
         try:
             rows = [msgspec.convert(json.loads(line), FileResult) for line in data[:whole].splitlines()]
         except (ValueError, msgspec.MsgspecError) as error:
@@ -122,12 +122,12 @@ class SearchResults(AbstractContextManager["SearchResults"]):
         self._stream.close()
 
     def has(self, file: File) -> bool:
-        """Return True if a file was searched, and a folder of images has as many as it had then."""
+        """Return True if a file was searched, and the number of images in a folder is unchanged."""
         result = self.files.get(str(file.path))
         return result is not None and result.pages == len(file.pages)
 
     def add(self, result: FileResult) -> None:
-        """Store the result of a file that was searched to its end, or to its damage."""
+        """Store the result of a completely searched or damaged file."""
         self.files[result.file] = result
         with writing(self._path):
             self._stream.write(json.dumps(msgspec.to_builtins(result), separators=(",", ":")).encode() + b"\n")
@@ -154,9 +154,9 @@ def write_detections(path: Path, intervals: Iterable[Interval]) -> None:
 
 
 def write_report(path: Path, objects: Iterable[str], results: Sequence[FileResult], intervals: list[Interval]) -> Path:
-    """Write the page of a search: the intervals of each object in the given order."""
-    found: dict[str, list[Interval]] = {name: [] for name in objects}
+    """Write the page of a search, with the intervals of each object in order."""
+    by_object: dict[str, list[Interval]] = {name: [] for name in objects}
     for interval in intervals:
-        found[interval.best.object].append(interval)
+        by_object[interval.best.object].append(interval)
     problems = [problem for result in results for problem in result.problems]
-    return write_page(path, "finding.html", files=len(results), found=found, most=_PICTURES, problems=problems)
+    return write_page(path, "finding.html", files=len(results), found=by_object, most=_PICTURES, problems=problems)

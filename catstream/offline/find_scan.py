@@ -1,7 +1,7 @@
 """The search of a frame for the objects of several models.
 
-All models are searched on one grid of sizes and aspect ratios. For each entry of the grid, a frame is resized and its
-cells are computed once, for all models whose objects may have this size and shape.
+All models share one grid of sizes and aspect ratios. For each entry of the grid, a frame is resized and its cells are
+computed once, for all models whose objects may have this size and shape.
 """
 
 from __future__ import annotations
@@ -30,19 +30,19 @@ from catstream.wire.messages import Model
 #: The minimum score of a detection.
 THRESHOLD = 0.5
 
-_SIZES = (0.4, 2.5)  # smallest and largest size that is searched, as multiples of the learned size
+_SIZES = (0.4, 2.5)  # smallest and largest searched size, as multiples of the learned size
 _SIZE_STEP = 1.25  # ratio of successive sizes of the grid
 _ASPECT_STEP = 1.25  # ratio of successive aspect ratios
-_MOST_PIXELS = 4_000_000  # of a resized frame: bounds the cost of a search for a tiny object in a large frame
-_WIDEST = 1.25  # of a window, as a multiple of the frame: its object fills the frame
-_SMALLEST = 24  # side of a window in pixels: a smaller one shows too little of its object
-_MOST_MAXIMA = 8  # windows of one size that are examined, and detections of one object in a frame
-_FITTED = 0.7  # share of the threshold from which a window is fitted: its score rises by less
+_MOST_PIXELS = 4_000_000  # maximum size of a resized frame, which bounds the cost for a tiny object in a large frame
+_WIDEST = 1.25  # maximum side of a window, as a multiple of the frame's: its object fills the frame
+_SMALLEST = 24  # minimum side of a window in pixels: smaller windows contain too little detail
+_MOST_MAXIMA = 8  # maximum number of examined windows of one size, and of detections of one object in a frame
+_FITTED = 0.7  # minimum score of a fitted window, as a share of the threshold: fitting raises scores by less
 
 
 @dataclass(frozen=True, slots=True)
 class Match:
-    """A window that shows an object, the object's box in it, and the score: see `Scan`."""
+    """A window with an object, the object's box, and the score: see `Scan`."""
 
     window: Window
     box: Box
@@ -51,7 +51,7 @@ class Match:
 
 @dataclass(frozen=True, slots=True)
 class _Template:
-    """A model, its measure of similarity, a window of the learned size, and the settings that it was learned with."""
+    """A model, its measure of similarity, a window of the learned size, and its settings."""
 
     model: Model
     similarity: Similarity
@@ -59,7 +59,7 @@ class _Template:
     settings: Settings
 
     def match(self, scores: ScoreMap, row: int, column: int, window: Window) -> Match:
-        """The match of a window whose features are at (row, column) of a map of appearance scores."""
+        """The match of a window with its features at (row, column) of a map of appearance scores."""
         score = min(1.0, float(scores.scores[row, column])) * self.similarity(scores.cells.row(row, column))
         return Match(window, window.box(), score)
 
@@ -78,14 +78,14 @@ class Scan:
         self._templates = [
             _Template(saved.model, saved.similarity(), Window.around(saved.box), saved.settings) for saved in models
         ]
-        self._grid: dict[tuple[int, int], list[int]] = defaultdict(list)  # entry -> numbers of the models
+        self._grid: dict[tuple[int, int], list[int]] = defaultdict(list)  # indices of models by entry
         for number, template in enumerate(self._templates):
             for entry in _entries(template.window):
                 self._grid[entry].append(number)
 
     @one_thread()
     def __call__(self, image: np.ndarray) -> list[list[Match]]:
-        """Search a frame, uint8 (h, w, 3): for each model, fitted windows that do not overlap, best first."""
+        """Search a frame, uint8 (h, w, 3): for each model, fitted windows without overlap, best first."""
         frame = Pyramid(image)
         results = []
         for template, windows in zip(self._templates, self.windows(frame), strict=True):
@@ -107,19 +107,19 @@ class Scan:
         return [_suppressed(of_model) for of_model in matches]
 
     def _maxima(self, cells: Cells, step: tuple[float, float], template: _Template) -> list[Match]:
-        """The best windows of one size, whose cells are `step` pixels wide and high."""
-        least = _FITTED * self._threshold
+        """The best windows of one size, with cells of `step` pixels."""
+        minimum = _FITTED * self._threshold
         model = template.model
-        # No similarity is above 1 / share.
-        appearance = cells.respond_above(model.weights, model.bias, least * template.similarity.share)
+        # The similarity is at most 1 / share.
+        appearance = cells.respond_above(model.weights, model.bias, minimum * template.similarity.share)
         scores = ScoreMap(cells, appearance, (0.0, 0.0), step)
-        places = non_maximum_suppression(appearance, _MOST_MAXIMA, WINDOW // 2)
-        matches = [template.match(scores, *place, scores.window(*place)) for place in places]
-        return [match for match in matches if match.score >= least]
+        positions = non_maximum_suppression(appearance, _MOST_MAXIMA, WINDOW // 2)
+        matches = [template.match(scores, *position, scores.window(*position)) for position in positions]
+        return [match for match in matches if match.score >= minimum]
 
 
 def _fitted(frame: Pyramid, window: Window, template: _Template) -> Match:
-    """A window at its best size and aspect ratio; the learned aspect ratio is likelier than others."""
+    """Fit the size and aspect ratio of a window, with the learned aspect ratio as the prior."""
     size = math.sqrt(window.area / template.window.area)
     likely = template.window.scaled(size).centred(*window.centre)
     context = FrameContext(frame, template.model, template.settings)
@@ -128,7 +128,7 @@ def _fitted(frame: Pyramid, window: Window, template: _Template) -> Match:
 
 
 def _entries(window: Window) -> list[tuple[int, int]]:
-    """The entries of the grid, exponents of size and aspect ratio, at which the object of a window is searched."""
+    """The searched entries of the grid, exponents of size and aspect ratio, for the learned window."""
     low, high = (math.log(math.sqrt(window.area) * size, _SIZE_STEP) for size in _SIZES)
     aspect = round(math.log(window.w / window.h, _ASPECT_STEP))
     return [(size, aspect) for size in range(math.ceil(low), math.floor(high) + 1)]
@@ -141,7 +141,7 @@ def _window(size: int, aspect: int) -> Window:
 
 
 def _is_searchable(window: Window, size: tuple[int, int]) -> bool:
-    """Return True if windows of a size are neither too small to show anything nor too large for a frame."""
+    """Return True if a window is neither too small nor too large for a frame."""
     (width, height), side = size, WINDOW * CELL
     if window.w > _WIDEST * width or window.h > _WIDEST * height or window.area < _SMALLEST**2:
         return False
@@ -149,7 +149,7 @@ def _is_searchable(window: Window, size: tuple[int, int]) -> bool:
 
 
 def _suppressed(matches: Iterable[Match]) -> list[Match]:
-    """Non-maximum suppression: the windows that overlap no better one, highest score first."""
+    """Non-maximum suppression: windows without overlap with a better one, highest score first."""
     best: list[Match] = []
     for match in sorted(matches, key=lambda match: -match.score):
         if len(best) < _MOST_MAXIMA and all(match.window.overlap(other.window) < SAME_OVERLAP for other in best):

@@ -1,7 +1,6 @@
 """Boxes at keyframes as text: `NAME@FRAME=X,Y,W,H` on the command line, and files `frame,object,x,y,w,h`.
 
-`absent` stands in the place of a box where the object is not in the frame, `hidden` where it is, but too much of it is
-covered to draw a box.
+Instead of a box, `absent` means that the object is not in the frame, and `hidden` that it is too occluded for a box.
 """
 
 from __future__ import annotations
@@ -21,17 +20,17 @@ from catstream.errors import BoxError, VideoError
 ABSENT = "absent"
 HIDDEN: Final = "hidden"
 
-#: The box of an object at a keyframe; None if it is absent, "hidden" if too much of it is covered to draw a box.
+#: The box of an object at a keyframe; None if it is absent, "hidden" if it is too occluded for a box.
 KeyframeBox = Box | Literal["hidden"] | None
 
-#: Name of an object, number of a frame, and the box of the object there.
+#: Name of an object, number of a frame, and the object's box in this frame.
 Keyframe = tuple[str, int, KeyframeBox]
 
 _HEADER = ("frame", "object", "x", "y", "w", "h", "file")
 
 
 def parse_keyframe(text: str) -> Keyframe:
-    """Parse `NAME@FRAME=X,Y,W,H`, or `@FRAME=X,Y,W,H` of an object without a name. BoxError if it is malformed.
+    """Parse `NAME@FRAME=X,Y,W,H`, or `@FRAME=X,Y,W,H` for an object without a name; BoxError if it is malformed.
 
     >>> parse_keyframe("anna@412=120,80,64,48")
     ('anna', 412, Box(x=120.0, y=80.0, w=64.0, h=48.0))
@@ -49,7 +48,7 @@ def parse_keyframe(text: str) -> Keyframe:
 
 
 def format_keyframe(name: str, frame: int, box: KeyframeBox) -> str:
-    """Return the text that `parse_keyframe` parses."""
+    """Format a keyframe for `parse_keyframe`."""
     return f"{name}@{frame}={','.join(filter(None, cells(box)))}"
 
 
@@ -68,15 +67,15 @@ def parse_row(row: Row, frame: int | None = None) -> Keyframe:
 
 
 def write_keyframes(path: Path, keyframes: Mapping[str, Mapping[int, KeyframeBox]], video: str = "") -> None:
-    """Write the file that `read_keyframes` reads, atomically, in the order of the frames; a batch reads it as well."""
+    """Write a table for `read_keyframes` and for a batch, atomically, in the order of the frames."""
     file = video and os.path.relpath(video, path.parent)
-    places = sorted((frame, name) for name, drawn in keyframes.items() for frame in drawn)
-    rows = ([frame, name, *cells(keyframes[name][frame]), file] for frame, name in places)
+    order = sorted((frame, name) for name, drawn in keyframes.items() for frame in drawn)
+    rows = ([frame, name, *cells(keyframes[name][frame]), file] for frame, name in order)
     write_table(path, _HEADER, rows, VideoError)
 
 
 def cells(box: KeyframeBox) -> tuple[str, ...]:
-    """The columns x, y, w, h of a box."""
+    """The cells x, y, w, h of a box."""
     return tuple(f"{side:.10g}" for side in box) if isinstance(box, Box) else (box or ABSENT, "", "", "")
 
 

@@ -11,13 +11,13 @@ from catstream.offline.keyframes import HIDDEN, KeyframeBox
 from catstream.offline.passes import box_of
 from catstream.wire.messages import Check, State, Track
 
-#: Probability from which a frame is checked.
+#: Minimum probability of a checked frame.
 CHECKED = 0.97
 
 
 @dataclass(frozen=True, eq=False)
 class ObjectTracks:
-    """The tracks of an object by frame, in arrays: each `Track` is made when it is read."""
+    """The tracks of an object by frame, stored as arrays; each `Track` is created on access."""
 
     name: str
     keyframes: dict[int, KeyframeBox]

@@ -19,7 +19,15 @@ from catstream.features.pyramid import Pyramid
 from catstream.video import rendered
 from catstream.wire.channels import CHANNELS
 from catstream.wire.codec import KINDS, VERSION, decode, encode
-from catstream.wire.messages import LARGEST_INITIAL_MODELS, Features, Health, ObjectFeatures, Sample, Track, TrainingRows
+from catstream.wire.messages import (
+    LARGEST_INITIAL_MODELS,
+    Features,
+    Health,
+    ObjectFeatures,
+    Sample,
+    Track,
+    TrainingRows,
+)
 from catstream.wire.schema import LONGEST_LIST, LONGEST_TEXT
 from tests.wire.examples import example
 
