@@ -21,6 +21,9 @@ from catstream.output.exports import EXPORTS
 from catstream.output.track_log import JoinedLog, logs_of
 from catstream.video.source import VIDEOS, open_source
 
+#: Formats with classes.
+_LABELLED = ", ".join(name for name, form in EXPORTS.items() if form.sized)
+
 
 def _printable(_: click.Context, __: click.Parameter, text: str) -> str:
     if not text.isprintable():
@@ -52,7 +55,7 @@ def _classes(context: click.Context, parameter: click.Parameter, text: str) -> l
     default="",
     metavar="NAME,...",
     callback=_classes,
-    help="Classes for coco, cvat and yolo in the order of their numbers; by default in order of appearance.",
+    help=f"Classes for {_LABELLED} in the order of their numbers; by default in order of appearance.",
 )
 @click.option("--images", is_flag=True, help="Also write the images of the tracked frames, for yolo.")
 @click.option("--skip-damaged", is_flag=True, help="Continue after a damaged line of LOG.")
@@ -73,9 +76,9 @@ def export(
 
     LOG is an .ndjson, .sqlite or .csv file of `catstream track` or `catstream
     sink`, all rotated files of one run, or their folder. For yolo, it may be the
-    folder of `catstream batch`, whose logs become one data set. The extension of DEST or --format selects the format.
-    Frames have their numbers in the source. CSV lacks the `doubtful` flag and
-    the frame in which a reused name began.
+    folder of `catstream batch`, whose logs become one data set. The extension of
+    DEST or --format selects the format. Frames have their numbers in the source.
+    CSV lacks the `doubtful` flag and the frame in which a reused name began.
 
     {table}
 
@@ -89,7 +92,7 @@ def export(
     # Step 1: check the options, and find the logs.
     form = exports.export_of(dest, name)
     if classes and not form.sized:
-        raise click.UsageError("--classes requires a format with classes: coco, cvat or yolo")
+        raise click.UsageError(f"--classes requires a format with classes: {_LABELLED}")
     if images and form is not EXPORTS["yolo"]:
         raise click.UsageError("--images requires --format yolo")
     logs = logs_of(files, skip_damaged=skip_damaged)
