@@ -247,7 +247,7 @@ class Subscription(Generic[Message]):
         while (message := connection.messages.receive(0)) is not None:
             if not isinstance(message, End):
                 if isinstance(message, Track | Features):
-                    self._gaps.take(message)
+                    self._gaps.take(message, self.run)
                     connection.read = message.time
                 return cast(Message, message)
             if self._channel.keeps == "every":  # the last message here

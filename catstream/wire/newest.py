@@ -197,9 +197,12 @@ class GapCounter:
         self.missed = self.before = self._next = 0
         self._of_one_object = of_one_object
         self._began: int | None = None  # first frame of the one object: it has no messages before
+        self._run = ""
 
-    def take(self, message: Track | Features) -> None:
-        """Count the missing frames before the next message."""
+    def take(self, message: Track | Features, run: str = "") -> None:
+        """Count the missing frames before the next message, of the run with this id."""
+        if run != self._run:  # a new run may count from 0 again
+            self._run, self._next = run, min(self._next, message.frame)
         if self._of_one_object and isinstance(message, Track) and message.began != self._began:
             self._began = message.began
             self._next = message.frame + 1
@@ -215,5 +218,5 @@ class GapCounter:
         if self._next:
             self.missed += max(0, frame - self._next)
         else:
-            self.before = frame
-        self._next = frame + 1
+            self.before += frame
+        self._next = max(self._next, frame + 1)

@@ -4,6 +4,7 @@ import asyncio
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from itertools import chain, repeat
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from catstream.wire import socket
 from catstream.wire.channels import HEALTH, MODELS, TRACKS
 from catstream.wire.discovery import reserve_endpoint
 from catstream.wire.messages import End, Features, Health, ObjectFeatures, TrainingRows
-from catstream.wire.newest import Publisher
+from catstream.wire.newest import GapCounter, Publisher
 from tests.wire.examples import model
 from tests.wire.examples import present as track
 
@@ -57,12 +58,20 @@ def test_closed_subscription_ends_loops_in_other_threads(attached):
             next(subscription)
 
 
+def test_gaps_are_counted_in_a_new_run_from_frame_zero():
+    gaps = GapCounter()
+    for run, frame in (("a", 7), ("a", 9), ("b", 0), ("b", 2)):
+        gaps.take(SimpleNamespace(frame=frame), run)
+    assert (gaps.before, gaps.missed) == (7, 2)
+
+
 @pytest.mark.parametrize(
     ("sent", "end", "missed"),
     [
         pytest.param([("", seq) for seq in range(2, 50)], 49, 0, id="all"),
         pytest.param([("", 2), ("", 5), ("", 6), ("", 10)], 12, 2 + 3 + 2, id="gaps, also before the end"),
         pytest.param([("", seq) for seq in (2, 3, 4, 2, 3, 4, 5)], 5, 0, id="repeated by a restarted detector"),
+        pytest.param([("", seq) for seq in (2, 3, 4, 5, 3, 6)], 6, 0, id="repeated in part"),
         pytest.param([("a", 2), ("b", 2), ("b", 3), ("a", 3), ("a", 6), ("b", 6)], 6, 2, id="several objects"),
     ],
 )
