@@ -143,7 +143,7 @@ def test_upload_rate_is_limited_except_after_a_command_or_failure(store, until, 
         until(lambda: len(written) == 2)
         last = stream.report()[0].frame
         until(lambda: stream.report()[0].frame > last + 100)
-        monkeypatch.setattr(stream, "_take", lambda *_: 1 / 0)
+        monkeypatch.setattr(stream, "_update_status", lambda *_: 1 / 0)
         until(lambda: stream.report()[0].state == "failed")
         until(lambda: stream.report()[0].token == 2)
         assert Store(store).stream("gate").newest().facts["frame"] > last + 100

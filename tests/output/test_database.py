@@ -95,7 +95,7 @@ def test_frames_dropped_from_a_full_queue_are_reported_at_the_end(tmp_path, monk
         for track in TRACKS:
             sink.write(TrackedFrame([track]))
     sink.write(TrackedFrame([replace(TRACKS[0], frame=9)]))
-    with pytest.raises(VideoError, match="lacks 2 frames, as another program locked it"):
+    with pytest.raises(VideoError, match="lacks 2 frames, because another program locked it"):
         sink.close()
     assert [frame.number for frame in Log(path)] == [3, 9]
 
