@@ -132,6 +132,8 @@ class RunProgress:
         if results := [str(file) for file in files if file is not None and file.exists()]:
             here = f"{Path.cwd()}/"
             lines.append(f"results: {', '.join(path.removeprefix(here) for path in results)}")
+        elif files == [None] and self._pipeline.results.write is None:
+            lines.append("results: none; --output DIR stores them")
         return "\n".join(lines)
 
     @property

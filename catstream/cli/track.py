@@ -156,6 +156,8 @@ def track(
         if contains_run(state):
             click.echo(f"the resumed run in {state} keeps its objects", err=True)
             resume, state, boxes, models = state, None, {}, {}
+    if source is None and resume is None:
+        raise click.UsageError("missing SOURCE: a video, a folder of images, a camera or a stream")
     pipeline = Pipeline(
         source,
         boxes or None,

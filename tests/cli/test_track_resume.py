@@ -124,7 +124,7 @@ def test_invalid_state_folder_is_an_error(killed, video, fail, tmp_path):
         "contains no run": ["track", "--resume", tmp_path / "none"],
         "state and resume are mutually exclusive": ["track", "--resume", kept, "--state", kept],
         "keeps its objects": ["track", "--resume", kept, "--box", "b=1,2,30,40"],
-        "missing source": ["track", "--box", box, "--state", tmp_path / "new"],
+        "missing SOURCE": ["track", "--box", box, "--state", tmp_path / "new"],
         "missing --state DIR": ["track", source, "--continue"],
         "--resume and --continue continue": ["track", source, "--state", kept, "--continue", "--overwrite"],
         f"{Path(source).name}' is a file": ["save", tmp_path / "one", "--state", source],
