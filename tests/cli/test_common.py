@@ -22,7 +22,7 @@ SIGNALS = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
 
 def progress_of(seen, **pipeline):
     """The progress of a run after the tracks of some frames."""
-    run = {"lost_seconds": 0, "holding": "", "totals": {}, "restarts": 0, "results": Results()}
+    run = {"lost_seconds": 0, "holding": "", "totals": {}, "restarts": 0, "results": Results(write=())}
     progress = RunProgress(SimpleNamespace(**run, **pipeline))
     for tracks in seen:
         progress.count(tracks)
