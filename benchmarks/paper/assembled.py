@@ -80,7 +80,7 @@ class Shared:
         self.told = 0
         return self
 
-    def follow(self, image: np.ndarray) -> tuple[float, Box]:
+    def track(self, image: np.ndarray) -> tuple[float, Box]:
         """Return the cached result of SCM for a frame."""
         if self.told == len(self.found):
             self.found.append(self.model.track(image))

@@ -197,8 +197,8 @@ def test_video_is_searched_by_time(tmp_path):
     ("name", "message"),
     [
         ("none.mp4", "no file or folder"),
-        ("empty", "neither images nor videos: "),
-        ("texts", r"neither images nor videos \(1 \.txt\)"),
+        ("empty", "no images or videos: "),
+        ("texts", r"no images or videos \(1 \.txt\)"),
         ("rtsp://a:b@c/d", "no file or folder 'rtsp://c/d'"),
     ],
 )
