@@ -87,7 +87,7 @@ def run(plan: Plan, video: Video, report: Report) -> Result:
 def _started(
     plan: Plan, streams: list[Stream], video: Video, stack: ExitStack, report: Report
 ) -> tuple[list[Observations], list[Subscribers]]:
-    """Start one pipeline after the other until it has its first models, then the subscribers; the stack ends them."""
+    """Start one pipeline after the other, wait for the first models of all, and start the subscribers."""
     started: list[Stream] = []
     observations: list[Observations] = []
 
@@ -107,19 +107,16 @@ def _started(
                     raise stream.error
 
     stack.callback(_stop, started)
-    # The object of a saved model need not be in the still image, from which the first models would be trained.
-    counts_from_first_track = plan.warm_up or not video.boxes
-
-    def has_begun(stream: Observations) -> bool:
-        return bool(stream.tracks) if counts_from_first_track else stream.warmed_up
-
     for stream in streams:
-        of_all = f"{stream.number + 1} of {len(streams)}"
+        activity = f"starting stream {stream.number + 1} of {len(streams)}"
         stream.start()
         started.append(stream)
-        wait_until(stream.ready.is_set, f"starting stream {of_all}")
+        wait_until(stream.ready.is_set, activity)
         observations.append(stack.enter_context(observed(stream.address, next(iter(video.boxes | video.models)))))
-        wait_until(partial(has_begun, observations[-1]), f"learning the first models of stream {of_all}")
+        wait_until(partial(bool, observations[-1].tracks), activity)
+    # The object of a saved model need not be in the still image, from which the first models would be trained.
+    if video.boxes and not plan.warm_up:
+        wait_until(lambda: all(stream.warmed_up for stream in observations), "learning the first models")
     groups = [
         stack.enter_context(Subscribers(plan, stream.number, channel, stream.address))
         for stream in streams
