@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Measures what depends on time, on a quiet machine, and writes the records and docs/results.md: 20 minutes.
+# Measures what depends on time, on a quiet machine, and writes the records and docs/results.md: 25 minutes.
 # PYTHON has the contrib modules of OpenCV 4, for CSRT and KCF; TRACKING_DATA is the folder of sequences.
 set -eu
 cd "$(dirname "$0")/.."
@@ -16,7 +16,8 @@ measure() { # NAME SCRIPT [OPTION...]: benchmarks/results/NAME.json
 
 measure startup "$python" benchmarks/startup.py --runs 3
 measure resume "$python" benchmarks/resume.py --moments 8
-"$python" benchmarks/provenance.py benchmarks/results/loadtest.json "$catstream" loadtest --streams 2 --duration 20
+"$python" benchmarks/provenance.py benchmarks/results/loadtest.json "$catstream" loadtest --find streams --streams 3 \
+    --source h264
 measure speed "$python" benchmarks/speed.py --frames 600 \
     --sequences TLD_01_david TLD_06_car OTB_Woman TLD_10_panda
 "$python" benchmarks/page.py

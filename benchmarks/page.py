@@ -228,14 +228,15 @@ def training(records: Records) -> str:
 
 
 def load(records: Records) -> str:
+    """The largest number of streams that `catstream loadtest --find streams` has found."""
     record = records["loadtest"]
-    streams, track, model = record["streams"], record["latency"]["track"], record["latency"]["model"]
-    cores = sum(stream["cores"] for stream in streams)
+    plan, track, model = record["plan"], record["latency"]["track"], record["latency"]["model"]
+    cores, size = sum(stream["cores"] for stream in record["streams"]), "x".join(map(str, plan["size"]))
     return _paragraph(
-        f"""**At least {len(streams)} of 640x480 pixels at {record["plan"]["rate"]:.0f} frames/s, with {cores:.1f} of
+        f"""**{record["highest"]} of {size} pixels at {plan["rate"]:.0f} frames/s over H.264, with {cores:.1f} of
         {record["machine"]["cores"]} cores.** The track of a frame arrives after {1000 * track["p50"]:.0f} ms (median;
-        99 % {1000 * track["p99"]:.0f} ms), the model trained on it after {1000 * model["p50"]:.0f} ms (99 %
-        {model["p99"]:.1f} s). `catstream loadtest` measures other loads."""
+        99 % {1000 * track["p99"]:.0f} ms), the model trained on it or on a newer frame after
+        {model["p50"]:.1f} s (99 % {model["p99"]:.1f} s). `catstream loadtest` measures other loads."""
     )
 
 
