@@ -32,11 +32,11 @@ from catstream.wire.messages import End, Health, Track, Tracks
 from catstream.wire.newest import Subscriber
 from catstream.wire.results import ResultsReceiver
 
-RESTART_SECONDS = 0.1  #: before the second restart in a minute; doubled for each further one
-RESTARTS, RECENT_SECONDS = 5, 60.0  #: how often a process may be restarted, and in which time
-APART_SECONDS = 3.0  #: that a process may have ended before the run; then it is started again
-SHUTDOWN_SECONDS = 12.0  #: limit for all processes to end, and for the detector after the end of the stream
-LEAST_SECONDS = 0.1  #: for each of them, also if the others have used all of that time
+RESTART_SECONDS = 0.1  #: delay of the second restart in a minute; doubled for each further one
+RESTARTS, RECENT_SECONDS = 5, 60.0  #: maximum number of restarts of a process within this time
+APART_SECONDS = 3.0  #: time for the run to end after one of its processes; then the process is restarted
+SHUTDOWN_SECONDS = 12.0  #: timeout for all processes to end, and for the detector after the end of the stream
+LEAST_SECONDS = 0.1  #: minimum for each of them, even if the others have used up the timeout
 ENDED = (0, SOURCE_FAILED)  #: exit codes of a process that has ended with the run
 
 _LAST_LINE = 2000  # bytes at the end of a log in which the last line is searched for
