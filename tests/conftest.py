@@ -1,4 +1,4 @@
-"""Fixtures of all tests; those of one folder are in its own conftest.py.
+"""Fixtures shared by all tests. Fixtures of a single folder are in its own conftest.py.
 
     data         rng, image, texture, scene: arrays; demo_video, walk, endless: files
     endpoints    folder, endpoint, tcp, keys, disk: sockets, files and keys of one test

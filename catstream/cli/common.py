@@ -62,7 +62,7 @@ def table(*headings: str, right: Collection[str] = ()) -> Table:
 
 
 def line_of(console: Console, *columns: ProgressColumn) -> Progress:
-    """A progress display of one line, which is erased at its end; without a terminal, a line every half minute.
+    """A progress display of one line, which is erased at its end; without a terminal, a line every `LINE_SECONDS`.
 
     columns : by default the description, a bar, how much of the total is done, and the time that remains
     """
@@ -95,9 +95,8 @@ class Interrupts:
 
     def __init__(self) -> None:
         self._leaving = self._deferring = self._pending = False
-        self.exit_code = (
-            128 + signal.SIGINT
-        )  #: of an interrupted command, as of a shell: 130 for Ctrl-C, 143 for SIGTERM
+        #: Exit code of an interrupted command, by the convention of shells: 130 for Ctrl-C, 143 for SIGTERM.
+        self.exit_code = 128 + signal.SIGINT
 
     def install(self) -> None:
         """Install the handlers. A signal that is ignored, as under nohup, stays ignored, except SIGTERM."""

@@ -69,7 +69,7 @@ class RunProgress:
             self._paused_seconds += self._updated - before
 
     def show(self, status: Status, console: Console) -> None:
-        """Update the line on a terminal, at most ten times a second; else print it at times, but not of a camera."""
+        """Update the line on a terminal; without one, print it every `LINE_SECONDS`, unless the source is live."""
         if self._updated - self._refreshed < (REFRESH_SECONDS if console.is_terminal else LINE_SECONDS):
             return
         self._refreshed = self._updated

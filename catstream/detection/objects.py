@@ -213,8 +213,8 @@ def assign(detections: Mapping[str, Detection], states: Mapping[str, DetectorSta
     # would lose most.
     disputed = [claim for claim in claims if claim.conflicts(claims)]
     disputed.sort(key=lambda claim: (claim.is_certain, claim.score - claim.elsewhere(claims).score), reverse=True)
-    # Step 3: each keeps its position if it is free. Otherwise, it gets one that is neither assigned nor claimed by a
-    # later object.
+    # Step 3: an object keeps its position if it is free. Otherwise, it moves to the best window that no object has, or
+    # claims later.
     pending = set(disputed)
     assigned = set(claims) - pending
     for claim in disputed:

@@ -204,7 +204,7 @@ class FleetSpec:
                 )
 
     def without(self, names: Collection[str]) -> dict[str, StreamSpec]:
-        """The streams without those of these names; FleetError if a name is unknown."""
+        """Return the streams except the named ones; FleetError if a name is unknown."""
         for name in names:
             if name not in self.streams:
                 streams = ", ".join(self.streams) or "none"

@@ -159,4 +159,4 @@ def write_report(path: Path, objects: Iterable[str], results: Sequence[FileResul
     for interval in intervals:
         by_object[interval.best.object].append(interval)
     problems = [problem for result in results for problem in result.problems]
-    return write_page(path, "finding.html", files=len(results), found=by_object, most=_PICTURES, problems=problems)
+    return write_page(path, "finding.html", files=len(results), objects=by_object, most=_PICTURES, problems=problems)

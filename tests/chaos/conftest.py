@@ -1,4 +1,4 @@
-"""The faults are those of `benchmarks/chaos.py`."""
+"""Fixtures with the faults of `benchmarks/chaos.py`."""
 
 import sys
 from pathlib import Path

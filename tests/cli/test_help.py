@@ -1,4 +1,4 @@
-"""What all commands have in common, and `catstream settings`."""
+"""The command line as a whole: imports, suggestions and exit codes; and `catstream settings`."""
 
 import signal
 

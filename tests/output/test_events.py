@@ -55,18 +55,18 @@ def test_only_the_selected_events_are_returned():
 
 @given(st.text(".0123456789", max_size=60))
 def test_events_of_any_history_are_in_pairs_and_agree_with_the_status(history):
-    events, found, inside = Events(DOOR), [], set()
+    events, kinds, inside = Events(DOOR), [], set()
     for track in tracks(history):
         for event in events.update([track]):
-            found.append(event.kind)
+            kinds.append(event.kind)
             {"entered": inside.add, "left": inside.discard}.get(event.kind, lambda _: None)(event.zone)
         status = events.status("")
         assert set(status["zones"]) == inside
         assert status["present"] or not inside
-    found += [event.kind for event in events.close()]
-    assert found.count("entered") == found.count("left")
-    assert found.count("lost") - found.count("returned") in (0, 1)
-    assert found[found.index("ended") :] == ["ended"] if history else not found
+    kinds += [event.kind for event in events.close()]
+    assert kinds.count("entered") == kinds.count("left")
+    assert kinds.count("lost") - kinds.count("returned") in (0, 1)
+    assert kinds[kinds.index("ended") :] == ["ended"] if history else not kinds
 
 
 def test_objects_of_a_lost_source_are_unknown_until_their_next_track():
@@ -110,8 +110,8 @@ def test_forgotten_object_ends_once_the_others_have_four_frames_more(together):
     frames = [[one, other] for one, other in zip(anna, ben, strict=False)] + [[one] for one in anna[4:]]
     if not together:
         frames = [[track] for frame in frames for track in frame]
-    found = [texts(events.update(frame)) for frame in frames]
-    assert found[-1] == ["3 ended"]
+    events_by_frame = [texts(events.update(frame)) for frame in frames]
+    assert events_by_frame[-1] == ["3 ended"]
     assert texts(events.close()) == ["7 ended"]
 
 

@@ -75,8 +75,8 @@ def test_resumed_run_continues_after_the_last_whole_frame(video, tmp_path, until
         after = list(pipeline)
     missing = [(frame, name) for frame in range(8, len(truth)) for name in boxes]
     assert [(track.frame, track.object) for track in after] == missing
-    found = [track.box is not None and track.box.overlap(truth[track.frame]) > 0.5 for track in after]
-    assert sum(found) > 0.8 * len(found)
+    hits = [track.box is not None and track.box.overlap(truth[track.frame]) > 0.5 for track in after]
+    assert sum(hits) > 0.8 * len(hits)
     assert pipeline.totals["stored"] == pipeline.totals["sent"] == len(truth)
 
 
